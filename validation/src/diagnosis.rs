@@ -403,7 +403,7 @@ impl Measurement<'_> {
         } else {
             return Ok(None);
         };
-        let products = match self.with(chain, "known.toml", &entry.words()).and_then(|chain| self.run(&chain, made)) {
+        let products = match self.with(chain, "known.toml", &[entry.words()]).and_then(|chain| self.run(&chain, made)) {
             Err(CampaignError::Failed { .. }) => return Ok(None),
             products => products?,
         };
@@ -416,16 +416,20 @@ impl Measurement<'_> {
         Ok(Some(acted.size.abs() * information.sqrt()))
     }
 
-    /// A chain whose model has one entry more, in a file of its own: the words of `dragfree model add` after the file.
-    fn with(&self, chain: &Chain, file: &str, words: &[&OsStr]) -> Result<Chain, CampaignError> {
+    /// A chain whose model has some entries more, in a file of its own: of each the words of `dragfree model add` after
+    /// the file.
+    fn with(&self, chain: &Chain, file: &str, entries: &[Vec<&OsStr>]) -> Result<Chain, CampaignError> {
         let model = self.folder.join(file);
         std::fs::copy(chain.model.as_deref().unwrap_or(Path::new("")), &model).map_err(|e| self.io(&e))?;
-        self.program.model(&[&["add".as_ref(), model.as_os_str()], words].concat())?;
+        for words in entries {
+            self.program.model(&[&["add".as_ref(), model.as_os_str()], &words[..]].concat())?;
+        }
         Ok(Chain { model: Some(model), ..chain.clone() })
     }
 
-    /// By how much χ² falls on other data of the same length, a day at most, with the first proposed formula and with
-    /// the true one, each fitted to the first day of the set.
+    /// By how much χ² falls on other data of the same length, a day at most, with what is proposed and with the true
+    /// formula, each fitted to the first day of the set. Proposed are the formulas that were chosen together, or the
+    /// first of those that the data do not tell from each other.
     fn kept_out(
         &self,
         chain: &Chain,
@@ -437,8 +441,9 @@ impl Measurement<'_> {
         let Some(entry) = true_formula(&acted.name) else { return Ok(None) };
         let others = self.other_data(made, acted)?;
         let without = self.on_other_data(chain, made, &others)?;
-        let fall = |file: &str, words: &[&OsStr]| -> Result<Option<f64>, CampaignError> {
-            let with = match self.with(chain, file, words).and_then(|chain| self.on_other_data(&chain, made, &others)) {
+        let fall = |file: &str, entries: &[Vec<&OsStr>]| -> Result<Option<f64>, CampaignError> {
+            let with = self.with(chain, file, entries).and_then(|chain| self.on_other_data(&chain, made, &others));
+            let with = match with {
                 Err(CampaignError::Failed { .. }) => return Ok(None),
                 with => with?,
             };
@@ -446,16 +451,19 @@ impl Measurement<'_> {
             let answer = self.program.ask(self.folder, &[&of_these[..], &["--archive", "archive"]].concat())?;
             Ok(answer["revisions"][1]["held_out"]["fall"]["delta_chi2"].as_f64())
         };
-        let first = said.diagnosis["formulas"].as_array().and_then(|all| all.first()).map(name_of);
-        let proposed = match first {
-            Some(name) => {
-                let from = self.folder.join("proposed.json");
-                std::fs::write(&from, said.diagnosis.to_string()).map_err(|e| self.io(&e))?;
-                fall("proposed.toml", &[name.as_ref(), "--from".as_ref(), from.as_os_str()])?
-            }
-            None => None,
-        };
-        Ok(Some(KeptOut { proposed, true_formula: fall("true.toml", &entry.words())? }))
+        let formulas = said.diagnosis["formulas"].as_array().map_or(&[][..], Vec::as_slice);
+        let chosen = formulas.iter().filter(|f| f["accepted"] == true).map(name_of);
+        let mut names: Vec<String> = chosen.collect();
+        if names.is_empty() {
+            names.extend(formulas.first().map(name_of));
+        }
+        let from = self.folder.join("proposed.json");
+        std::fs::write(&from, said.diagnosis.to_string()).map_err(|e| self.io(&e))?;
+        let of_it = |name: &String| [OsString::from(name), "--from".into(), from.clone().into()];
+        let entries: Vec<[OsString; 3]> = names.iter().map(of_it).collect();
+        let entries: Vec<Vec<&OsStr>> = entries.iter().map(|e| e.iter().map(OsString::as_os_str).collect()).collect();
+        let proposed = if entries.is_empty() { None } else { fall("proposed.toml", &entries)? };
+        Ok(Some(KeptOut { proposed, true_formula: fall("true.toml", &[entry.words()])? }))
     }
 
     /// Data on which the same acts, of another seed and day.

@@ -171,7 +171,7 @@ pub(crate) struct Diagnosed {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct KeptOut {
-    /// The first formula that the diagnosis proposes; `None` if it proposes none, or the program cannot run it.
+    /// The formulas that the diagnosis proposes; `None` if it proposes none, or the program cannot run them.
     pub(crate) proposed: Option<f64>,
     /// The formula of the force that acts; `None` if the program cannot run it.
     pub(crate) true_formula: Option<f64>,

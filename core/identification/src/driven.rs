@@ -9,7 +9,7 @@ use dragfree_estimation::sigma::NoiseModel;
 use nalgebra::{Complex, DMatrix, DVector};
 
 use crate::coherence::{Driver, HousekeepingCoherence, Part};
-use crate::slow_samples::{OWN, SlowSamples, Stretch, Whitened};
+use crate::slow_samples::{BesideWalk, OWN, SlowSamples, Stretch, Whitened};
 
 /// Ratio of the lags that are tried before the best is refined.
 const RATIO: f64 = 2.0;
@@ -55,6 +55,28 @@ pub struct Driven {
     pub memory: Memory,
     /// Twice the rise of the logarithm of the likelihood with the declared noise.
     pub gain: f64,
+}
+
+impl Driven {
+    /// What it adds to a combination of channels per unit, by itself; a product with its factors too, since where each is
+    /// zero is not known.
+    pub(crate) fn acting(&self, beside: &BesideWalk, housekeeping: &HousekeepingCoherence) -> Vec<Vec<DVector<f64>>> {
+        let gain = beside.gains().dot(&housekeeping.places[self.place].response);
+        let of = |driver: Driver| {
+            let series = beside.samples.series(driver, self.memory, &housekeeping.level);
+            gain * DVector::from_vec(series)
+        };
+        let own = of(self.driver);
+        if own.norm_squared() == 0.0 {
+            return Vec::new();
+        }
+        let factors = self.driver.factors();
+        let with_factors = (!factors.is_empty()).then(|| {
+            let factors = factors.into_iter().map(of).filter(|factor| factor.norm_squared() > 0.0);
+            std::iter::once(own.clone()).chain(factors).collect()
+        });
+        std::iter::once(vec![own.clone()]).chain(with_factors).collect()
+    }
 }
 
 impl SlowSamples {

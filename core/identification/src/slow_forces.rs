@@ -6,7 +6,9 @@ use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
 use nalgebra::DVector;
 
 use crate::candidates::Candidate;
+use crate::driven::Driven;
 use crate::scores::{CandidateScorer, Fit};
+use crate::slow_samples::BesideWalk;
 use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::{NoiseError, NoiseModel};
 
@@ -50,8 +52,9 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
         .collect()
 }
 
-/// Slow forces without those that one of `candidates` explains better. A random walk whose power is made to fit takes
-/// what drifts evenly, and beside it the candidate that acts would explain next to nothing.
+/// Slow forces without those that one of `candidates`, or one of the `driven` ones, which are the best of so many
+/// functions that were `tried`, explains better. A random walk whose power is made to fit takes what drifts evenly, and
+/// beside it the cause that acts would explain next to nothing.
 ///
 /// # Errors
 /// The declared noise and the slow forces contradict each other.
@@ -61,6 +64,7 @@ pub fn not_explained(
     slow: &[NoiseProcess],
     declared: &[NoiseProcess],
     candidates: &[Candidate],
+    (driven, tried): (&[Driven], f64),
 ) -> Result<Vec<NoiseProcess>, NoiseError> {
     let (set, gathered) = (scorer.candidate_set, scorer.gathered);
     let candidates: Vec<&Candidate> =
@@ -72,7 +76,12 @@ pub fn not_explained(
         let others = slow.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, other)| other);
         let noise: Vec<NoiseProcess> = declared.iter().chain(others).cloned().collect();
         let noise = NoiseModel::new(&noise, &set.channels, 1.0 / gathered.rate_hz)?;
-        if !gathered.slow.is_explained(&along, &candidates, &fit.added, &noise) {
+        let is_explained = |beside: BesideWalk| {
+            let causes: Vec<_> = candidates.iter().map(|c| beside.acting(c)).filter(|all| !all.is_empty()).collect();
+            let driven: Vec<_> = driven.iter().flat_map(|d| d.acting(&beside, &gathered.housekeeping)).collect();
+            beside.is_explained_by_one_of(&causes, causes.len() as f64) || beside.is_explained_by_one_of(&driven, tried)
+        };
+        if !gathered.slow.beside_a_walk(&along, &fit.added, &noise).is_some_and(is_explained) {
             left.push(force.clone());
         }
     }

@@ -323,39 +323,19 @@ impl SlowSamples {
         chosen
     }
 
-    /// Whether one of some candidates explains a force `along` a direction better than a random walk of acceleration
-    /// does, whose power is whatever explains most: each by itself beside what is `added` and the noise. Where a
-    /// candidate has more free numbers, each costs the logarithm of the number of samples (Schwarz, 1978), and being
-    /// the best of many costs twice the logarithm of their number.
-    pub(crate) fn is_explained(
+    /// What is left of the channels `along` a direction, beside what is `added` and the noise, and what a random walk of
+    /// acceleration explains of it, whose power is whatever explains most. None where a covariance is singular.
+    pub(crate) fn beside_a_walk(
         &self,
         along: &DVector<f64>,
-        candidates: &[&Candidate],
         added: &[Candidate],
         noise: &NoiseModel,
-    ) -> bool {
+    ) -> Option<BesideWalk> {
         let (thin, means_s) = self.thinned();
-        let better = || {
-            let mut whitened = thin.whitened(along, noise, &means_s)?;
-            thin.add_to(&mut whitened, added)?;
-            let explained = |candidate: &&Candidate| {
-                let forms = candidate.parts.iter().map(|(_, form)| form);
-                let acting: Vec<DVector<f64>> = forms.filter_map(|form| thin.acting(form, &whitened.gains)).collect();
-                let white = (!acting.is_empty()).then(|| whitened.whiten(&DMatrix::from_columns(&acting)))??;
-                let left = whitened.left(&white);
-                let own = left.column_iter().zip(white.column_iter());
-                let own = own.filter(|(left, white)| left.norm_squared() > OWN * white.norm_squared());
-                let own: Vec<DVector<f64>> = own.map(|(left, _)| left.into_owned()).collect();
-                // A random walk has one free number.
-                let more = own.len().saturating_sub(1) as f64;
-                Some(whitened.explained(own.into_iter()) - more * (whitened.y.len() as f64).ln())
-            };
-            let all: Vec<f64> = candidates.iter().filter_map(explained).collect();
-            let best = all.iter().copied().reduce(f64::max)?;
-            let walk = whitened.explained_by_a_walk(&whitened.left(&whitened.whiten(&thin.walk())?));
-            Some(best - 2.0 * (all.len() as f64).ln() > walk)
-        };
-        better().unwrap_or(false)
+        let mut whitened = thin.whitened(along, noise, &means_s)?;
+        thin.add_to(&mut whitened, added)?;
+        let explained = whitened.explained_by_a_walk(&whitened.left(&whitened.whiten(&thin.walk())?));
+        Some(BesideWalk { samples: thin, whitened, explained })
     }
 
     /// Adds what acts on a combination of channels to its model; none where a covariance is singular.
@@ -411,6 +391,45 @@ impl SlowSamples {
             });
         }
         sum.filter(|s| s.norm_squared() > 0.0)
+    }
+}
+
+/// A slow force along a direction, and what a random walk explains of it.
+pub(crate) struct BesideWalk {
+    /// The samples, so far apart as they are weighed.
+    pub(crate) samples: SlowSamples,
+    whitened: Whitened,
+    explained: f64,
+}
+
+impl BesideWalk {
+    /// What a force of one unit in each channel adds to the combination of channels that shows the direction.
+    pub(crate) fn gains(&self) -> &DVector<f64> {
+        &self.whitened.gains
+    }
+
+    /// What a candidate adds to that combination, by coefficient.
+    pub(crate) fn acting(&self, candidate: &Candidate) -> Vec<DVector<f64>> {
+        let forms = candidate.parts.iter().map(|(_, form)| form);
+        forms.filter_map(|form| self.samples.acting(form, self.gains())).collect()
+    }
+
+    /// Whether one of some causes, each by itself, explains the force better than the random walk does: `causes` are
+    /// what each adds, by amplitude, and `tried` is of how many they are the best. Where a cause has more free numbers
+    /// than the walk's one, each costs the logarithm of the number of samples (Schwarz, 1978), and being the best of
+    /// many costs twice the logarithm of their number.
+    pub(crate) fn is_explained_by_one_of(&self, causes: &[Vec<DVector<f64>>], tried: f64) -> bool {
+        let explained = |acting: &Vec<DVector<f64>>| {
+            let white = (!acting.is_empty()).then(|| self.whitened.whiten(&DMatrix::from_columns(acting)))??;
+            let left = self.whitened.left(&white);
+            let own = left.column_iter().zip(white.column_iter());
+            let own = own.filter(|(left, white)| left.norm_squared() > OWN * white.norm_squared());
+            let own: Vec<DVector<f64>> = own.map(|(left, _)| left.into_owned()).collect();
+            let more = own.len().saturating_sub(1) as f64;
+            Some(self.whitened.explained(own.into_iter()) - more * (self.whitened.y.len() as f64).ln())
+        };
+        let best = causes.iter().filter_map(explained).reduce(f64::max);
+        best.is_some_and(|best| best - 2.0 * tried.max(1.0).ln() > self.explained)
     }
 }
 
@@ -675,15 +694,15 @@ pub(crate) mod tests {
                 rules: Vec::new(),
             };
             let all: Vec<Candidate> = (0..8).map(|k| set.candidate(&[k], 0)).collect();
-            let all: Vec<&Candidate> = all.iter().collect();
             let is_explained = |force: &dyn Fn(f64) -> f64| {
                 let samples = samples(seed, hours, |t| size * force(t), &series, &[]);
-                usize::from(samples.is_explained(&first(), &all, &[], &noise()))
+                let beside = samples.beside_a_walk(&first(), &[], &noise()).expect("a covariance");
+                let causes: Vec<_> = all.iter().map(|c| beside.acting(c)).collect();
+                assert!(seed > 0 || !beside.is_explained_by_one_of(&[], 1.0), "by no cause");
+                usize::from(beside.is_explained_by_one_of(&causes, 8.0))
             };
             unknown += is_explained(&walks[0]);
             own += is_explained(&walks[1]);
-            let samples = samples(seed, hours, |t| size * walks[0](t), &series, &[]);
-            assert!(seed > 0 || !samples.is_explained(&first(), &[], &[], &noise()), "by no candidate");
         }
         assert_eq!(own, 100);
         assert!(unknown <= 5, "{unknown}");

@@ -13,6 +13,7 @@ use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::distributions::ln_chi2_above;
+use dragfree_identification::driven::Driven;
 use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
@@ -263,7 +264,7 @@ fn decide(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<(Last, Spectra), WorkflowError> {
     let settings = replay.settings()?;
-    let FirstPoint { mut point, walks, mut slow } = FirstPoint::new(&spectra, settings)?;
+    let FirstPoint { mut point, walks, mut slow } = FirstPoint::new(&spectra, settings, evidence)?;
     let mut screened = spectra.screened.clone();
     let mut named: Vec<Candidate> = Vec::new();
     // A pass that fits constants beside what is named comes first, at the start and where a form is new: they are 1e5 σ
@@ -360,13 +361,13 @@ struct FirstPoint {
     point: Point,
     /// Slow forces beside the declared noise that the residuals of the model show.
     walks: Vec<NoiseProcess>,
-    /// Those of them that no candidate explains better.
+    /// Those of them that neither a candidate nor a proposed formula explains better.
     slow: Vec<NoiseProcess>,
 }
 
 impl FirstPoint {
     /// A glitch is no slow force, although it has the power of one.
-    fn new(spectra: &Spectra, settings: &Settings) -> Result<Self, WorkflowError> {
+    fn new(spectra: &Spectra, settings: &Settings, evidence: &Evidence<'_>) -> Result<Self, WorkflowError> {
         let (scorer, set) = (spectra.scorer(settings), &spectra.record.candidate_set);
         let fit = scorer.fit(&[])?;
         let model = &set.coefficients[..set.model()];
@@ -380,7 +381,9 @@ impl FirstPoint {
         let beside = scorer.fit(&events)?;
         let (declared, forms) = (&spectra.record.noise, &spectra.screened.forms);
         let walks = slow_forces(&scorer, &beside, declared);
-        let slow = not_explained(&scorer, &beside, &walks, declared, forms)?;
+        let driven: Vec<Driven> = evidence.proposals.iter().map(|proposal| proposal.driven).collect();
+        let driven = (&driven[..], evidence.trials.of(FORMULA));
+        let slow = not_explained(&scorer, &beside, &walks, declared, forms, driven)?;
         Ok(Self { point: Point::at(values), walks, slow })
     }
 }

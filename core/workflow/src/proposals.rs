@@ -31,6 +31,8 @@ const MOST_GAIN: f64 = 0.3;
 pub(crate) struct Proposal {
     /// The model's entry.
     pub(crate) entry: EffectEntry,
+    /// What it states.
+    pub(crate) driven: Driven,
     /// The housekeeping in it as among drivers that are coherent with a residual, `hk/battery_current_a^2`.
     pub(crate) driver: String,
     /// Logarithm of its weight before any data, in that of formulas. Products with commands, whose constant part makes
@@ -129,6 +131,7 @@ fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str, of_pr
     };
     (readable(&expression) && rms > 0.0).then(|| Proposal {
         entry: entry(instance, &acts_on, &expression, &slow.unit_of_amplitude(of, driver, memory), most / rms),
+        driven: *driven,
         ln_weight,
         driver: slow.label(driver.housekeeping()),
         words: format!("{expression} on {acts_on}"),
