@@ -449,7 +449,7 @@ fn gain(parts: &[Part]) -> f64 {
 mod tests {
     use super::*;
     use crate::coherence::Direction;
-    use crate::slow_samples::tests::{first, noise, samples};
+    use crate::slow_samples::tests::{first, noise, random_walk, samples};
     use dragfree_estimation::spectra::Plan;
 
     /// Housekeeping without sums of segments: what is fast is told by nothing.
@@ -504,6 +504,31 @@ mod tests {
         assert_eq!(all.unit_of_amplitude("m s-2", Driver::Derivative(0), Memory::Integral), "m s-2 A-1");
         assert_eq!(all.unit_of_amplitude("N", Driver::Derivative(0), Memory::None), "N s A-1");
         assert_eq!(all.unit_of_amplitude("A", Driver::Value(0), Memory::None), "1");
+    }
+
+    /// A force that is the product of two of six housekeeping channels whose zeros are unknown is explained by them
+    /// better than by a random walk, and one that follows none of them is not. Of 200 sets of nine hours (seeds 0 to 199)
+    /// 195 are, and 13 of those in which the force follows none, as the best of so many functions resembles it by chance.
+    /// Of 40 sets with these rates fewer than 33, and more than 11, are with a probability of 6e-6 each.
+    #[test]
+    fn a_driven_force_is_told_from_a_random_walk() {
+        let (hours, size) = (9.0, 1e-14);
+        let housekeeping = none(6);
+        let (mut own, mut others) = (0, 0);
+        for seed in 0..40 {
+            let walks: Vec<_> = (0..7).map(|k| random_walk(5000 + 10 * seed + k, hours)).collect();
+            let series: Vec<&dyn Fn(f64) -> f64> = walks[..6].iter().map(|w| w as &dyn Fn(f64) -> f64).collect();
+            let is_explained = |force: &dyn Fn(f64) -> f64| {
+                let all = samples(seed, hours, |t| size * force(t), &[], &series);
+                let beside = all.beside_a_walk(&first(), &[], &noise()).expect("a covariance");
+                let found = all.driven(&[0], &noise(), &housekeeping);
+                let causes: Vec<_> = found.iter().flat_map(|d| d.acting(&beside, &housekeeping)).collect();
+                usize::from(beside.is_explained_by_one_of(&causes, all.functions(&[0], &housekeeping) as f64))
+            };
+            own += is_explained(&|t| (walks[0](t) - 1.0) * (walks[1](t) + 0.5));
+            others += is_explained(&walks[6]);
+        }
+        assert!(own >= 33 && others <= 11, "{own} {others}");
     }
 
     /// Without a force the gain of one function is χ² of one degree of freedom, so that its mean over 300 sets is one:

@@ -666,7 +666,7 @@ pub(crate) mod tests {
     }
 
     /// A random walk with steps of unit variance in every hour.
-    fn random_walk(seed: u64, hours: f64) -> impl Fn(f64) -> f64 {
+    pub(crate) fn random_walk(seed: u64, hours: f64) -> impl Fn(f64) -> f64 {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let step = (IN_S / 3600.0).sqrt();
         let mut sum = 0.0;
