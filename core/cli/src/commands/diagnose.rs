@@ -144,7 +144,12 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
         }
     }
     if !d.formulas.is_empty() {
-        let _ = writeln!(out, "\nFormulas that would explain it");
+        let several = match (d.formulas.len(), together(d).len()) {
+            (2.., 0) => ", each",
+            (all @ 2.., chosen) if chosen == all => ", together",
+            _ => "",
+        };
+        let _ = writeln!(out, "\nFormulas that would explain it{several}");
         d.formulas.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     if !unnamed.is_empty() {
@@ -161,13 +166,19 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}{repeated}", f.effect, f.instance);
     }
-    if let Some(f) = d.formulas.first() {
+    let first = d.formulas.first().filter(|_| together(d).is_empty());
+    for f in together(d).into_iter().chain(first) {
         let _ = writeln!(out, "\nnext      {}", added(f, repeated));
     }
     for (name, reason) in &d.not_tried {
         let _ = writeln!(out, "not tried {name}: {reason}");
     }
     out
+}
+
+/// Formulas that were chosen together; none where the data do not tell those that are proposed from each other.
+fn together(d: &Diagnosis) -> Vec<&Found> {
+    d.formulas.iter().filter(|f| f.accepted).collect()
 }
 
 /// The command that adds a formula to a model.
