@@ -58,8 +58,8 @@ pub struct Driven {
 }
 
 impl Driven {
-    /// What it adds to a combination of channels per unit, by itself; a product with its factors too, since where each is
-    /// zero is not known.
+    /// What it adds to a combination of channels per unit, by itself; a product with its factors too, since where each
+    /// is zero is not known.
     pub(crate) fn acting(&self, beside: &BesideWalk, housekeeping: &HousekeepingCoherence) -> Vec<Vec<DVector<f64>>> {
         let gain = beside.gains().dot(&housekeeping.places[self.place].response);
         let of = |driver: Driver| {
@@ -507,9 +507,9 @@ mod tests {
     }
 
     /// A force that is the product of two of six housekeeping channels whose zeros are unknown is explained by them
-    /// better than by a random walk, and one that follows none of them is not. Of 200 sets of nine hours (seeds 0 to 199)
-    /// 195 are, and 13 of those in which the force follows none, as the best of so many functions resembles it by chance.
-    /// Of 40 sets with these rates fewer than 33, and more than 11, are with a probability of 6e-6 each.
+    /// better than by a random walk, and one that follows none of them is not. Of 200 sets of nine hours (seeds 0 to
+    /// 199) 195 are, and 13 of those in which the force follows none, as the best of so many functions resembles it by
+    /// chance. Of 40 sets with these rates fewer than 33, and more than 11, are with a probability of 6e-6 each.
     #[test]
     fn a_driven_force_is_told_from_a_random_walk() {
         let (hours, size) = (9.0, 1e-14);

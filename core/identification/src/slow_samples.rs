@@ -323,8 +323,8 @@ impl SlowSamples {
         chosen
     }
 
-    /// What is left of the channels `along` a direction, beside what is `added` and the noise, and what a random walk of
-    /// acceleration explains of it, whose power is whatever explains most. None where a covariance is singular.
+    /// What is left of the channels `along` a direction, beside what is `added` and the noise, and what a random walk
+    /// of acceleration explains of it, whose power is whatever explains most. None where a covariance is singular.
     pub(crate) fn beside_a_walk(
         &self,
         along: &DVector<f64>,

@@ -109,8 +109,8 @@ fn template(name: &str) -> Option<(&str, &str, &str)> {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 pub struct Parameter {
-    /// Name. Three have a meaning for `diagnose`: `at_ns`, when a transient begins, `frequency_hz`, at which a line acts,
-    /// and `fine`, 1 for candidates about one shape.
+    /// Name. Three have a meaning for `diagnose`: `at_ns`, when a transient begins, `frequency_hz`, at which a line
+    /// acts, and `fine`, 1 for candidates about one shape.
     pub name: String,
     /// Type of its value.
     #[serde(rename = "type")]
