@@ -30,8 +30,8 @@ use crate::answer::{
 };
 use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{
-    Decided, How, Judge, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
-    with_numbers,
+    Decided, How, Judge, PASSES, Place, Point, Reached, Settled, moved, one_pass, settle, step, step_of_model,
+    transients_near_ends, with_numbers,
 };
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
@@ -270,7 +270,7 @@ fn decide(
     // A pass that fits constants beside what is named comes first, at the start and where a form is new: they are 1e5 σ
     // away, a filter would take them for noise, and with the unknown mean of its series a form that explains nothing
     // would seem to explain what rounding leaves of the constants.
-    let (mut opening, mut passes) = (true, 0);
+    let (mut opening, mut passes, mut from) = (true, 0, None);
     loop {
         let forms = spectra.forms(&screened, &evidence.proposals);
         let chosen: Vec<EffectEntry> = forms.iter().map(|form| evidence.entry(form)).collect();
@@ -281,7 +281,7 @@ fn decide(
         }
         if passes > 0 {
             let named: Vec<EffectEntry> = named.iter().map(|form| evidence.entry(form)).collect();
-            point = settle(replay, &named, &slow, point, evidence, progress)?;
+            point = settle(replay, &named, &slow, from.take(), point, evidence, progress)?;
         }
         let decided = one_pass(replay, &chosen, &slow, How::Select, &point, evidence, progress)?;
         let next = step(&point, &decided);
@@ -305,10 +305,13 @@ fn decide(
         if now != named {
             moving.extend(differences(&now, &named));
         }
+        // A step is too long where it leads to less likelihood. That of another model says nothing of it.
+        let adds = named.iter().all(|form| now.contains(form));
+        from = adds.then(|| Reached::new(&point, &decided));
         point = next;
         // What seemed to explain a slow force is not named.
         if now.is_empty() && named.is_empty() && slow != walks && passes < PASSES {
-            slow.clone_from(&walks);
+            (slow, from) = (walks.clone(), None);
             continue;
         }
         if moving.is_empty() || passes == PASSES {
@@ -327,32 +330,11 @@ fn decide(
                 point.values.insert(spectra.record.candidate_set.coefficients[index].name.clone(), *value);
             }
             opening = beside.forms.iter().any(|form| !screened.forms.contains(form));
-            slow = slow_forces(&scorer, &fit, &spectra.record.noise);
+            let before = std::mem::replace(&mut slow, slow_forces(&scorer, &fit, &spectra.record.noise));
+            from = from.filter(|_| !opening && slow == before);
             screened = Screened { forms: beside.forms, ..screened };
         }
     }
-}
-
-/// Passes with what is named alone, until levels of noise and values stay: they take a small part of the time of one
-/// with all candidates.
-fn settle(
-    replay: &Replay<'_>,
-    named: &[EffectEntry],
-    slow: &[NoiseProcess],
-    mut point: Point,
-    evidence: &Evidence<'_>,
-    progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Point, WorkflowError> {
-    for _ in 0..PASSES {
-        let fitted = one_pass(replay, named, slow, How::Fit, &point, evidence, progress)?;
-        let next = step(&point, &fitted);
-        let settled = moved(&point, &next, &fitted).is_empty();
-        point = next;
-        if settled {
-            break;
-        }
-    }
-    Ok(point)
 }
 
 /// Where the passes begin.

@@ -23,12 +23,14 @@ mod ends;
 mod experiment;
 mod numbers;
 mod pass;
+mod settling;
 mod stretches;
 
 pub(crate) use ends::transients_near_ends;
 pub(crate) use experiment::{Experiment, InBlock, Settled, information};
 pub(crate) use numbers::with_numbers;
 use pass::{At, Constant, Filtered};
+pub(crate) use settling::{Reached, settle};
 pub(crate) use stretches::{Alone, Stretches};
 use stretches::{Stretch, stretches};
 
@@ -151,6 +153,9 @@ pub(crate) struct Decided {
     /// That of each product by itself; none where there is only one.
     pub(crate) by_product: Vec<Quadratic>,
     pub(crate) chi2: f64,
+    /// Minus twice the logarithm of the likelihood where the pass was made, with what is known before any data, up to a
+    /// constant of the data.
+    height: f64,
     pub(crate) numbers: f64,
     pub(crate) channels: BTreeMap<String, BTreeSet<String>>,
     /// Values of the parameters at which the pass was made.
@@ -207,7 +212,7 @@ impl Decided {
     /// Information of some coefficients in one product, and their score about zero, with the noise levels and the
     /// powers of time fitted; others are zero.
     fn reduced(&self, part: &Part, kept: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
-        let mut sums = no_sums(self.parameters.len());
+        let mut sums = Sums::zeros(self.parameters.len(), 0);
         part.add_to(&mut sums);
         let about_zero = &sums.information * DVector::from_column_slice(&self.start);
         sums.score.iter_mut().zip(about_zero.iter()).for_each(|(score, moved)| *score += moved);
@@ -252,7 +257,7 @@ pub(crate) fn joined(
         let places = product.coefficients.into_iter().enumerate();
         let mut place = |c: Coefficient| all.place((c.name.clone(), Meaning::Coefficient(Box::new(c))));
         let places = places.map(|(i, c)| (i, place(c))).collect();
-        let mut sums = no_sums(0);
+        let mut sums = Sums::zeros(0, 0);
         (sums.information, sums.score) = (product.information, product.score.as_slice().to_vec());
         (sums.chi2, sums.numbers) = (product.chi2, product.numbers);
         all.parts.push(Part { sums, moments: None, stretches: Vec::new(), places });
@@ -444,6 +449,7 @@ impl Part {
         all.chi2 += self.sums.chi2;
         all.numbers += self.sums.numbers;
         all.samples += self.sums.samples;
+        all.ln_det += self.sums.ln_det;
     }
 
     /// Starts of its stretches as they follow all `parameters`.
@@ -454,19 +460,6 @@ impl Part {
             Start { state: start.state.clone(), slope }
         };
         self.sums.starts.iter().map(of_all).collect()
-    }
-}
-
-/// No sums of so many parameters.
-fn no_sums(parameters: usize) -> Sums {
-    Sums {
-        information: DMatrix::zeros(parameters, parameters),
-        score: vec![0.0; parameters],
-        chi2: 0.0,
-        numbers: 0.0,
-        squares: DMatrix::zeros(0, 0),
-        samples: 0,
-        starts: Vec::new(),
     }
 }
 
@@ -576,11 +569,13 @@ impl Joined {
             })
             .collect();
         let p = parameters.len();
-        let mut sums = no_sums(p);
+        let mut sums = Sums::zeros(p, 0);
         self.parts.iter().for_each(|part| part.add_to(&mut sums));
+        let known = priors.iter().map(|(terms, prior)| prior.chi2(terms, &start)).sum::<f64>();
+        let height = sums.chi2 + sums.ln_det + known;
         let starts = self.parts.iter().map(|part| part.starts(p)).collect();
         let of_product = |part: &Part| {
-            let mut own = no_sums(p);
+            let mut own = Sums::zeros(p, 0);
             part.add_to(&mut own);
             Quadratic::new(&own, &start, &priors, candidates.clone())
         };
@@ -607,6 +602,7 @@ impl Joined {
             quadratic,
             by_product,
             chi2: sums.chi2,
+            height,
             numbers: sums.numbers,
             channels: self.channels,
             constants: self.constants,

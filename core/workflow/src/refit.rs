@@ -315,24 +315,12 @@ impl Basis {
 
     /// χ² of what is known of the coefficients beside the data.
     fn beside_data(&self, values: &DVector<f64>) -> f64 {
-        let pull = |(terms, prior): &(Vec<(usize, f64)>, Prior)| {
-            let sum: f64 = terms.iter().map(|(i, weight)| weight * values[*i]).sum();
-            ((sum - prior.mean) / prior.sigma).powi(2)
-        };
-        self.priors.iter().map(pull).sum()
+        self.priors.iter().map(|(terms, prior)| prior.chi2(terms, values.as_slice())).sum()
     }
 
     fn quadratic(&self, days: &[&Day]) -> Quadratic {
         let n = self.coefficients.len();
-        let mut sums = Sums {
-            information: DMatrix::zeros(n, n),
-            score: vec![0.0; n],
-            chi2: 0.0,
-            numbers: 0.0,
-            squares: DMatrix::zeros(0, 0),
-            samples: 0,
-            starts: Vec::new(),
-        };
+        let mut sums = Sums::zeros(n, 0);
         for day in days {
             for (j, b) in day.places.iter().enumerate() {
                 sums.score[*b] += day.score[j];

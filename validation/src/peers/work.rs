@@ -413,9 +413,8 @@ fn selection(folder: &ScratchFolder) -> Result<Task, CampaignError> {
             score: x.tr_mul(&y).as_slice().to_vec(),
             chi2: y.norm_squared(),
             numbers: ROWS as f64,
-            squares: DMatrix::zeros(0, 0),
             samples: ROWS as u64,
-            starts: Vec::new(),
+            ..Sums::zeros(0, 0)
         };
         let candidates = (0..REGRESSORS).map(Candidate::free).collect();
         let quadratic = Quadratic::new(&sums, &[0.0; REGRESSORS], &[], candidates);

@@ -66,6 +66,14 @@ pub struct Prior {
     pub sigma: f64,
 }
 
+impl Prior {
+    /// Square of the distance of a sum of parameters with these values from the mean, in σ.
+    pub fn chi2(&self, terms: &[(usize, f64)], values: &[f64]) -> f64 {
+        let sum: f64 = terms.iter().map(|(i, weight)| weight * values[*i]).sum();
+        ((sum - self.mean) / self.sigma).powi(2)
+    }
+}
+
 /// Values, their covariance and the gain 2 Δ ln L.
 #[derive(Clone, Debug)]
 pub struct Fitted {

@@ -66,6 +66,8 @@ pub struct Sums {
     pub squares: DMatrix<f64>,
     /// Number of samples.
     pub samples: u64,
+    /// Logarithm of the determinant of the covariance of the innovations, over all samples.
+    pub ln_det: f64,
     /// The start of each stretch without a gap.
     pub starts: Vec<Start>,
 }
@@ -109,6 +111,8 @@ pub struct Passed {
     pub blocks: Vec<Block>,
     /// The start of each stretch without a gap.
     pub starts: Vec<Start>,
+    /// Logarithm of the determinant of the covariance of the innovations of a sample.
+    ln_det: f64,
     parameters: usize,
     channels: usize,
 }
@@ -118,6 +122,7 @@ impl Passed {
     pub fn total(&self) -> Sums {
         let mut sums = Sums::zeros(self.parameters, self.channels);
         self.blocks.iter().for_each(|block| sums.add(block));
+        sums.ln_det = self.ln_det * sums.samples as f64;
         sums.starts.clone_from(&self.starts);
         sums
     }
@@ -186,6 +191,7 @@ impl Sums {
             numbers: 0.0,
             squares: DMatrix::zeros(channels, channels),
             samples: 0,
+            ln_det: 0.0,
             starts: Vec::new(),
         }
     }
@@ -219,6 +225,8 @@ struct Waiting {
 /// A pass over the data.
 pub struct Innovations {
     kernel: Kernel,
+    /// Logarithm of the determinant of the covariance of the innovations of a sample.
+    ln_det: f64,
     unit: Vec<f64>,
     /// What is known of the channels: taken off before anything else.
     known: Vec<Response>,
@@ -369,6 +377,7 @@ impl Innovations {
             settled: 0,
             without_data: false,
             ends: None,
+            ln_det: predictor.ln_det(),
             kernel,
         };
         pass.restart();
@@ -673,7 +682,7 @@ impl Innovations {
             self.starts.pop();
         }
         let (parameters, channels) = (self.lanes.len() - 1, self.kernel.channels);
-        Passed { blocks: self.blocks, starts: self.starts, parameters, channels }
+        Passed { blocks: self.blocks, starts: self.starts, ln_det: self.ln_det, parameters, channels }
     }
 }
 

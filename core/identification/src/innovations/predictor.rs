@@ -128,6 +128,11 @@ impl Predictor {
         Change { gain: gain.rows(0, known).into_owned(), innovation: w * innovation * w.transpose(), beside }
     }
 
+    /// Logarithm of the determinant of S.
+    pub fn ln_det(&self) -> f64 {
+        -2.0 * self.whitening.diagonal().iter().map(|w| w.ln()).sum::<f64>()
+    }
+
     /// Covariance of what an infinite past tells of the moving averages: that of their states without what it leaves
     /// open.
     pub fn known_of_the_start(&self, system: &NoiseStates) -> DMatrix<f64> {

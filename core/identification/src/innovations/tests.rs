@@ -724,6 +724,7 @@ fn quadratic(information: DMatrix<f64>, truth: &[f64], candidates: Vec<Candidate
         numbers: 0.0,
         squares: DMatrix::zeros(1, 1),
         samples: 0,
+        ln_det: 0.0,
         starts: Vec::new(),
     };
     Quadratic::new(&sums, &vec![0.0; truth.len()], &[(vec![(0, 1.0)], Prior { mean: 0.0, sigma: 1e6 })], candidates)

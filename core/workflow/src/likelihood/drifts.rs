@@ -7,10 +7,10 @@
 
 use dragfree_identification::diagnosis::{DRIFT, Drift};
 use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
-use dragfree_identification::innovations::filter::DAY_NS;
+use dragfree_identification::innovations::filter::{DAY_NS, Sums};
 use dragfree_schema::{AT_NS, Coefficient, FREQUENCY_HZ, Settings};
 
-use super::{Decided, Judge, Meaning, no_sums};
+use super::{Decided, Judge, Meaning};
 use crate::proposals::FORMULA;
 
 /// Whether a candidate's time, frequency or formula was chosen by these data: its rate has as many trials as that
@@ -118,9 +118,9 @@ impl Decided {
     /// The likelihood with the rates as further parameters and candidates, per day about an instant.
     fn with_rates(&self, changing: &[Changing], days: f64, about_ns: i64) -> Quadratic {
         let p = self.parameters.len();
-        let mut sums = no_sums(p + changing.len());
+        let mut sums = Sums::zeros(p + changing.len(), 0);
         for part in &self.parts {
-            let mut own = no_sums(p);
+            let mut own = Sums::zeros(p, 0);
             part.add_to(&mut own);
             for i in 0..p {
                 sums.score[i] += own.score[i];
@@ -224,7 +224,7 @@ mod tests {
         // Moments of time since the begin of the day.
         let (once, squared) = (0.5 + mean, (0.5 + mean).powi(2) + spread * spread);
         let at_begin = value - 0.5 * rate;
-        let mut sums = no_sums(1);
+        let mut sums = Sums::zeros(1, 0);
         (sums.information, sums.score, sums.numbers) = (DMatrix::identity(1, 1), vec![at_begin + rate * once], 1e4);
         let moments = Moments {
             from_ns: 0,

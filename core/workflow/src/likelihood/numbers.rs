@@ -8,14 +8,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::run::Progress;
-use dragfree_identification::innovations::filter::Start;
+use dragfree_identification::innovations::filter::{Start, Sums};
 use dragfree_schema::{AT_NS, Coefficient, FREQUENCY_HZ};
 use nalgebra::{DMatrix, DVector};
 use serde_json::{Value, json};
 
 use super::{
-    Decided, How, Joined, Meaning, PASSES, Part, Place, Point, REACHED_SIGMAS, Settled, no_sums, one_pass, step,
-    sums_of_pass,
+    Decided, How, Joined, Meaning, PASSES, Part, Place, Point, REACHED_SIGMAS, Settled, one_pass, step, sums_of_pass,
 };
 use crate::WorkflowError;
 use crate::answer::Evidence;
@@ -242,7 +241,7 @@ impl Joined {
             column.iter().for_each(|(old, factor)| to_old[(*old, new)] += factor);
         }
         let of_part = |part: &Part| {
-            let mut sums = no_sums(self.parameters.len());
+            let mut sums = Sums::zeros(self.parameters.len(), 0);
             part.add_to(&mut sums);
             sums.information = to_old.tr_mul(&(&sums.information * &to_old));
             sums.score = to_old.tr_mul(&DVector::from_column_slice(&sums.score)).as_slice().to_vec();
