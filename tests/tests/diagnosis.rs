@@ -379,6 +379,14 @@ fn increased_torque_noise_is_found_alone() {
     assert!((value - 2.0).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
 }
 
+/// Torque noise ten times as loud as declared, far from where a pass begins: steps that lead to less likelihood are
+/// halved. As they were, levels went to zero and to infinity, and the program ended with an error.
+#[test]
+fn noise_far_from_the_declared_one_is_found_alone() {
+    let d = diagnosis(&["--hours", "3", "--seed", "61", "--effect", "torque-noise:sc.z=10"]);
+    assert_eq!(named_alone(&d, 10.0), "torque-noise:sc.z");
+}
+
 /// A readout 1.657 times as loud as declared, of two hours, is found alone with its size. A likelihood that went back
 /// to the declared levels whenever the form of a named effect changed did not settle: 1.707 ± 0.005, and a thermal
 /// force that did not act.

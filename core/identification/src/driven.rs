@@ -59,11 +59,16 @@ pub struct Driven {
 
 impl Driven {
     /// What it adds to a combination of channels per unit, by itself; a product with its factors too, since where each
-    /// is zero is not known.
-    pub(crate) fn acting(&self, beside: &BesideWalk, housekeeping: &HousekeepingCoherence) -> Vec<Vec<DVector<f64>>> {
-        let gain = beside.gains().dot(&housekeeping.places[self.place].response);
+    /// is zero is not known. `response` is the acceleration in each channel per unit where it acts, `level` as of
+    /// [`HousekeepingCoherence`]. Nothing where a series in it is not among the samples, as of commands in sums that
+    /// were made without formulas on the spacecraft.
+    pub(crate) fn acting(&self, response: &DVector<f64>, beside: &BesideWalk, level: &[f64]) -> Vec<Vec<DVector<f64>>> {
+        if !beside.samples.has(self.driver) {
+            return Vec::new();
+        }
+        let gain = beside.gains().dot(response);
         let of = |driver: Driver| {
-            let series = beside.samples.series(driver, self.memory, &housekeeping.level);
+            let series = beside.samples.series(driver, self.memory, level);
             gain * DVector::from_vec(series)
         };
         let own = of(self.driver);
@@ -157,6 +162,12 @@ impl SlowSamples {
         }
         found.sort_by(|a, b| b.gain.total_cmp(&a.gain));
         found
+    }
+
+    /// Whether every series in a function is among the samples.
+    fn has(&self, driver: Driver) -> bool {
+        let has = |stretch: &Stretch| driver.of().iter().all(|i| *i < stretch.housekeeping.len());
+        self.products.iter().flatten().all(has)
     }
 
     /// Samples of a function in all stretches.
@@ -522,13 +533,29 @@ mod tests {
                 let all = samples(seed, hours, |t| size * force(t), &[], &series);
                 let beside = all.beside_a_walk(&first(), &[], &noise()).expect("a covariance");
                 let found = all.driven(&[0], &noise(), &housekeeping);
-                let causes: Vec<_> = found.iter().flat_map(|d| d.acting(&beside, &housekeeping)).collect();
+                let acting = |d: &Driven| d.acting(&first(), &beside, &housekeeping.level);
+                let causes: Vec<_> = found.iter().flat_map(acting).collect();
                 usize::from(beside.is_explained_by_one_of(&causes, all.functions(&[0], &housekeeping) as f64))
             };
             own += is_explained(&|t| (walks[0](t) - 1.0) * (walks[1](t) + 0.5));
             others += is_explained(&walks[6]);
         }
         assert!(own >= 33 && others <= 11, "{own} {others}");
+    }
+
+    /// Samples that were made without a command say nothing of its product with housekeeping, and all of housekeeping
+    /// alone.
+    #[test]
+    fn a_function_acts_where_all_its_series_are_among_the_samples() {
+        let cause = wave(3.1, 0.0);
+        let all = samples(8, 24.0, |t| 5e-14 * cause(t), &[], &[&cause]);
+        let beside = all.beside_a_walk(&first(), &[], &noise()).expect("a covariance");
+        let acting = |driver: Driver| {
+            let driven = Driven { place: 0, driver, memory: Memory::None, gain: 0.0 };
+            driven.acting(&first(), &beside, &[0.0])
+        };
+        assert!(acting(Driver::Modulated(0, 1)).is_empty());
+        assert_eq!(acting(Driver::Value(0)).len(), 1);
     }
 
     /// Without a force the gain of one function is χ² of one degree of freedom, so that its mean over 300 sets is one:

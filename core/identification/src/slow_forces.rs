@@ -64,7 +64,7 @@ pub fn not_explained(
     slow: &[NoiseProcess],
     declared: &[NoiseProcess],
     candidates: &[Candidate],
-    (driven, tried): (&[Driven], f64),
+    (driven, tried): (&[(Driven, DVector<f64>)], f64),
 ) -> Result<Vec<NoiseProcess>, NoiseError> {
     let (set, gathered) = (scorer.candidate_set, scorer.gathered);
     let candidates: Vec<&Candidate> =
@@ -78,7 +78,8 @@ pub fn not_explained(
         let noise = NoiseModel::new(&noise, &set.channels, 1.0 / gathered.rate_hz)?;
         let is_explained = |beside: BesideWalk| {
             let causes: Vec<_> = candidates.iter().map(|c| beside.acting(c)).filter(|all| !all.is_empty()).collect();
-            let driven: Vec<_> = driven.iter().flat_map(|d| d.acting(&beside, &gathered.housekeeping)).collect();
+            let level = &gathered.housekeeping.level;
+            let driven: Vec<_> = driven.iter().flat_map(|(d, response)| d.acting(response, &beside, level)).collect();
             beside.is_explained_by_one_of(&causes, causes.len() as f64) || beside.is_explained_by_one_of(&driven, tried)
         };
         if !gathered.slow.beside_a_walk(&along, &fit.added, &noise).is_some_and(is_explained) {

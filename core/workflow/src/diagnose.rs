@@ -13,7 +13,6 @@ use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::distributions::ln_chi2_above;
-use dragfree_identification::driven::Driven;
 use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
@@ -363,7 +362,7 @@ impl FirstPoint {
         let beside = scorer.fit(&events)?;
         let (declared, forms) = (&spectra.record.noise, &spectra.screened.forms);
         let walks = slow_forces(&scorer, &beside, declared);
-        let driven: Vec<Driven> = evidence.proposals.iter().map(|proposal| proposal.driven).collect();
+        let driven: Vec<_> = evidence.proposals.iter().map(|p| (p.driven, p.response.clone())).collect();
         let driven = (&driven[..], evidence.trials.of(FORMULA));
         let slow = not_explained(&scorer, &beside, &walks, declared, forms, driven)?;
         Ok(Self { point: Point::at(values), walks, slow })

@@ -7,6 +7,7 @@ use dragfree_engine::config::EffectEntry;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::driven::Driven;
 use dragfree_identification::record::Record;
+use nalgebra::DVector;
 
 use crate::WorkflowError;
 use crate::replay::Replay;
@@ -33,6 +34,8 @@ pub(crate) struct Proposal {
     pub(crate) entry: EffectEntry,
     /// What it states.
     pub(crate) driven: Driven,
+    /// Acceleration in each channel per unit of the force where it acts.
+    pub(crate) response: DVector<f64>,
     /// The housekeeping in it as among drivers that are coherent with a residual, `hk/battery_current_a^2`.
     pub(crate) driver: String,
     /// Logarithm of its weight before any data, in that of formulas. Products with commands, whose constant part makes
@@ -132,6 +135,7 @@ fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str, of_pr
     (readable(&expression) && rms > 0.0).then(|| Proposal {
         entry: entry(instance, &acts_on, &expression, &slow.unit_of_amplitude(of, driver, memory), most / rms),
         driven: *driven,
+        response: housekeeping.places[driven.place].response.clone(),
         ln_weight,
         driver: slow.label(driver.housekeeping()),
         words: format!("{expression} on {acts_on}"),
