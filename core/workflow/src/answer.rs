@@ -161,6 +161,31 @@ pub(crate) fn found(
     }
 }
 
+/// Refuses what is named in the place of an effect that the data want outside of its physical range: that one is
+/// refused, and what is like it takes its place.
+pub(crate) fn refuse_stand_ins(
+    (named, others): (&mut Vec<Found>, &mut Vec<Found>),
+    decided: &Decided,
+    evidence: &Evidence<'_>,
+    settings: &Settings,
+) {
+    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let (range, more) = (settings.range_sigmas.powi(2), -settings.false_alarm.ln());
+    for c in &set {
+        let Some(outside) = decided.quadratic.stands_in_for(*c, &set, range, more) else { continue };
+        let other = &decided.candidates[outside.candidate];
+        let size = |k: &usize| outside.free[*k].abs() / outside.covariance[(*k, *k)].sqrt();
+        let lead = (0..outside.free.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0);
+        let (_, unit) = coefficient(decided, other.parameters[lead]);
+        let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+        let (name, value) = (evidence.name_of(other), outside.free[lead]);
+        let why = format!("{name} explains more in its place, with {value:.2e}{unit}, outside its physical range");
+        let place = &decided.candidates[*c];
+        let is_it = |f: &mut Found| (&f.effect, &f.instance) == (&place.effect, &place.instance);
+        others.extend(named.extract_if(.., is_it).map(|f| Found { accepted: false, refused: Some(why.clone()), ..f }));
+    }
+}
+
 /// Gives a named effect the form and the values that it has where the numbers in its form are fitted.
 pub(crate) fn fit_form(named: &mut Found, fitted: &Decided, evidence: &Evidence<'_>, settings: &Settings) {
     let is_it = |f: &&Fitted| {
@@ -378,6 +403,15 @@ fn channels_of(record: &Record, component: &str) -> Vec<String> {
         p.enters.iter().filter(move |(_, gains)| gains[k] != 0.0).map(|(channel, _)| channel.clone())
     })
     .collect()
+}
+
+/// Where nothing is named, the reasons for which what is significant is refused.
+pub(crate) fn why_none_is_named(named: &[Found], others: &[Found]) -> Vec<String> {
+    let refused = |f: &Found| {
+        let reason = f.refused.as_ref()?;
+        Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
+    };
+    if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() }
 }
 
 /// What is missing, by what is named and whether something is left.

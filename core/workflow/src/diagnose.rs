@@ -25,7 +25,8 @@ use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{
-    Evidence, apart, contradict, drifting, fit_form, found, limits, noise_levels, offsets, verdict, with_levels,
+    Evidence, apart, contradict, drifting, fit_form, found, limits, noise_levels, offsets, refuse_stand_ins, verdict,
+    why_none_is_named, with_levels,
 };
 use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{
@@ -465,6 +466,7 @@ fn answer(
         decided.selection.chosen.iter().map(|f| found(settings, decided, f, evidence, true)).collect();
     let mut others: Vec<Found> =
         decided.selection.rest.iter().map(|f| found(settings, decided, f, evidence, false)).collect();
+    refuse_stand_ins((&mut named, &mut others), decided, evidence, settings);
     let is_formula = |f: &Found| evidence.proposal(&f.effect, &f.instance).is_some();
     let mut formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
     others.retain(|f| !is_formula(f));
@@ -506,12 +508,7 @@ fn answer(
     let levels = noise_levels(decided, record, evidence, settings);
     let levels = with_levels(&mut named, &levels, decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
-    let refused = |f: &Found| {
-        let reason = f.refused.as_ref()?;
-        Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
-    };
-    let mut reasons: Vec<String> =
-        if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() };
+    let mut reasons = why_none_is_named(&named, &others);
     if !moving.is_empty() {
         let names: Vec<&str> = moving.iter().map(String::as_str).collect();
         reasons.push(format!("the likelihood is not settled after {PASSES} passes: {} still move", names.join(", ")));

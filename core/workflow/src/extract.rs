@@ -21,7 +21,8 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use crate::answer::{
-    Evidence, NoiseLevel, Rival, apart, contradict, found, limits, offsets, rivals_of_all, verdict, with_levels,
+    Evidence, NoiseLevel, Rival, apart, contradict, found, limits, offsets, refuse_stand_ins, rivals_of_all, verdict,
+    why_none_is_named, with_levels,
 };
 use crate::likelihood::{CoefficientSums, Decided, Stretches, joined};
 use crate::{ManyDays, WorkflowError};
@@ -412,13 +413,15 @@ fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence
     let of = |accepted: bool| move |f| found(settings, decided, f, evidence, accepted);
     let mut named: Vec<Found> = decided.selection.chosen.iter().map(of(true)).collect();
     let mut others: Vec<Found> = decided.selection.rest.iter().map(of(false)).collect();
+    refuse_stand_ins((&mut named, &mut others), decided, evidence, settings);
     let levels: Vec<&[NoiseLevel]> = extracts.iter().map(Extract::levels).collect();
     let levels = with_levels(&mut named, &levels_of_all(&levels), decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let left = |e: &Extract| Some(format!("{} alone: {}", e.product, e.unexplained.as_ref()?));
     let agreement = decided.agreement();
-    let reasons: Vec<String> =
-        apart(agreement.as_ref(), settings).into_iter().chain(extracts.iter().filter_map(left)).collect();
+    let mut reasons = why_none_is_named(&named, &others);
+    reasons.extend(apart(agreement.as_ref(), settings));
+    reasons.extend(extracts.iter().filter_map(left));
     let verdict = verdict(&named, !reasons.is_empty());
     others.truncate(settings.max_evaluated);
     named.extend(others);

@@ -471,6 +471,26 @@ impl Quadratic {
         fitted
     }
 
+    /// What one of a set stands in for, if anything: among the candidates that the data want outside of their ranges
+    /// by more than `range`, the one with the most evidence in its place. That is more than the set has by `more`, as a
+    /// logarithm, and leaves the one of the set the smaller part of its gain.
+    pub fn stands_in_for(&self, candidate: usize, set: &[usize], range: f64, more: f64) -> Option<Fitted> {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
+        let with = |c: usize| [&others[..], &[c]].concat();
+        let least = self.ln_evidence(set) + more;
+        let own = self.beside(candidate, set).gain;
+        let takes_most = |outside: usize| {
+            let gain = |all: &[usize]| self.fit_without_ranges_of(Some(outside), all).1;
+            let beside = with(outside);
+            gain(&[&beside[..], &[candidate]].concat()) - gain(&beside) < 0.5 * own
+        };
+        let left = (0..self.candidates.len()).filter(|c| !set.contains(c) && self.observable(*c, &others));
+        let explains = left.map(|c| (c, self.ln_evidence(&with(c)))).filter(|(_, evidence)| *evidence > least);
+        let outside = explains.map(|(c, evidence)| (self.beside(c, &others), evidence));
+        let all = outside.filter(|(f, _)| f.beyond > range && takes_most(f.candidate));
+        all.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(fitted, _)| fitted)
+    }
+
     /// The candidates.
     pub fn candidates(&self) -> &[Candidate] {
         &self.candidates

@@ -100,7 +100,8 @@ fn some_point(system: &NoiseStates) -> NoisePoint {
     point
 }
 
-/// Innovations are the data whitened by the Cholesky factor of the covariance of all samples, once the start is over.
+/// Innovations are the data whitened by the Cholesky factor of the covariance of all samples, once the start is over,
+/// and the determinant of their covariance is the part of a sample in that of all.
 #[test]
 fn innovations_equal_those_of_the_covariance_of_all_samples() {
     let system = system();
@@ -127,6 +128,8 @@ fn innovations_equal_those_of_the_covariance_of_all_samples() {
         }
     }
     assert!(worst < 1e-6, "{worst:e}");
+    let of_channel = |i: usize| 2.0 * (factor[(2 * 250 + i, 2 * 250 + i)] / system.unit[i]).ln();
+    assert!((predictor.ln_det() - of_channel(0) - of_channel(1)).abs() < 1e-9);
 }
 
 /// A pass over `data` (rows of channels) with the series.
@@ -174,9 +177,8 @@ fn blocks(
 
 /// `log L` of the innovations that a pass sums.
 fn log_likelihood(system: &NoiseStates, point: &NoisePoint, data: &[[f64; 2]]) -> f64 {
-    let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
     let sums = pass(system, point, Vec::new(), data, &[], 1);
-    sums.samples as f64 * predictor.whitening.determinant().ln() - 0.5 * sums.chi2
+    -0.5 * (sums.ln_det + sums.chi2)
 }
 
 fn noise(samples: usize, seed: u64) -> Vec<[f64; 2]> {
@@ -717,16 +719,7 @@ fn blocks_are_what_their_rows_add() {
 
 fn quadratic(information: DMatrix<f64>, truth: &[f64], candidates: Vec<Candidate>) -> Quadratic {
     let score: Vec<f64> = (&information * DVector::from_column_slice(truth)).iter().copied().collect();
-    let sums = Sums {
-        information,
-        score,
-        chi2: 0.0,
-        numbers: 0.0,
-        squares: DMatrix::zeros(1, 1),
-        samples: 0,
-        ln_det: 0.0,
-        starts: Vec::new(),
-    };
+    let sums = Sums { information, score, ..Sums::zeros(truth.len(), 1) };
     Quadratic::new(&sums, &vec![0.0; truth.len()], &[(vec![(0, 1.0)], Prior { mean: 0.0, sigma: 1e6 })], candidates)
 }
 
@@ -828,6 +821,30 @@ fn a_value_outside_its_range_refuses_no_other() {
     // By 0.2 beyond the end, with what the other leaves of the information.
     assert!((outside.beyond - 0.04 * (1e4 - 9e6 / 1e4)).abs() < 1e-6, "{}", outside.beyond);
     assert_eq!(q.select(&evidence(2)).chosen.iter().map(|c| c.candidate).collect::<Vec<_>>(), [1]);
+}
+
+/// Of two that are much alike the data want the first outside of its range: the second explains less in its place, and
+/// stands in for it. Inside its range the first is what is chosen, and a third that is like neither stands for itself.
+#[test]
+fn what_is_like_a_value_outside_its_range_stands_in_for_it() {
+    let (n, rho) = (1e4, 0.7);
+    let mut information = DMatrix::identity(4, 4);
+    let rows = [n, rho * n, 0.0, rho * n, n, 0.0, 0.0, 0.0, n];
+    information.view_mut((1, 1), (3, 3)).copy_from(&DMatrix::from_row_slice(3, 3, &rows));
+    let all = || (1..4).map(candidate).collect();
+    let (range, more) = (14.0, 1e3_f64.ln());
+    let far = quadratic(information.clone(), &[0.0, 0.4, 0.0, 0.2], all());
+    let set: Vec<usize> = far.select(&evidence(2)).chosen.iter().map(|f| f.candidate).collect();
+    assert_eq!(set, [1, 2]);
+    let outside = far.stands_in_for(1, &set, range, more).expect("the first explains more");
+    assert!(outside.candidate == 0 && (outside.free[0] - 0.4).abs() < 1e-9);
+    assert!(far.stands_in_for(2, &set, range, more).is_none());
+    let near = quadratic(information, &[0.0, 0.2, 0.0, 0.2], all());
+    let set: Vec<usize> = near.select(&evidence(2)).chosen.iter().map(|f| f.candidate).collect();
+    assert_eq!(set, [0, 2]);
+    assert!(set.iter().all(|c| near.stands_in_for(*c, &set, range, more).is_none()));
+    // Weighed with the range as wide as it is, the second would be named.
+    assert!(far.stands_in_for(1, &[1, 2], f64::INFINITY, more).is_none());
 }
 
 /// What acts has a correlation of ρ with a level of the noise, which is fitted beside everything: of its χ² 1 − ρ² is

@@ -46,21 +46,24 @@ pub(crate) fn settle(
 ) -> Result<Point, WorkflowError> {
     let (mut steps, mut halved) = (0, 0);
     while steps < PASSES {
-        let fitted = match one_pass(replay, named, slow, How::Fit, &point, judge, progress) {
-            // Levels of noise so far off that nothing is left of it in some combination of the channels.
-            Err(WorkflowError::NoLikelihood(_)) if from.is_some() => None,
-            fitted => Some(fitted?),
-        };
-        let rises = |reached: &Reached| fitted.as_ref().is_none_or(|f| f.height > reached.height + RISE);
-        if let Some(before) = from.as_ref().filter(|reached| rises(reached)) {
-            if halved == PASSES {
+        let fitted = one_pass(replay, named, slow, How::Fit, &point, judge, progress);
+        if let Some(before) = &from {
+            let rises = match &fitted {
+                // A likelihood that is no number is no higher one either.
+                Ok(fitted) => fitted.height.is_nan() || fitted.height > before.height + RISE,
+                // Levels of noise so far off that nothing is left of it in some combination of the channels.
+                Err(error) => matches!(error, WorkflowError::NoLikelihood(_)),
+            };
+            if rises && halved == PASSES {
                 return Ok(before.point.clone());
             }
-            point = before.point.halfway(point);
-            halved += 1;
-            continue;
+            if rises {
+                point = before.point.halfway(point);
+                halved += 1;
+                continue;
+            }
         }
-        let Some(fitted) = fitted else { break };
+        let fitted = fitted?;
         let next = step(&point, &fitted);
         let settled = moved(&point, &next, &fitted).is_empty();
         from = Some(Reached::new(&point, &fitted));
@@ -88,5 +91,39 @@ impl Point {
         let starts = to.starts.iter_mut().flatten().zip(self.starts.iter().flatten());
         starts.filter(|(to, from)| to.len() == from.len()).for_each(|(to, from)| *to = (&*to + from) * 0.5);
         to
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::DVector;
+
+    /// Halfway lie values and starts by their mean, levels by their geometric mean. What only the other has counts from
+    /// nothing, a level from the declared one, a power from itself; starts of another number of states stay.
+    #[test]
+    fn halfway_lies_between_two_points() {
+        let start = DVector::from_column_slice;
+        let of = |all: &[(&str, f64)]| all.iter().map(|(name, x)| ((*name).to_owned(), *x)).collect();
+        let point = |values, levels, powers, starts| Point {
+            values: of(values),
+            levels: of(levels),
+            powers: of(powers),
+            starts: vec![starts],
+            ..Point::default()
+        };
+        let from =
+            point(&[("a", 1.0), ("left", 9.0)], &[("x", 2.0)], &[("p", 4.0)], vec![start(&[2.0]), start(&[7.0])]);
+        let to = point(
+            &[("a", 2.0), ("b", 3.0)],
+            &[("x", 8.0), ("y", 9.0)],
+            &[("p", 1.0), ("q", 6.0)],
+            vec![start(&[4.0]), start(&[1.0, 1.0])],
+        );
+        let halfway = from.halfway(to);
+        assert_eq!(halfway.values, of(&[("a", 1.5), ("b", 1.5)]));
+        assert_eq!(halfway.levels, of(&[("x", 4.0), ("y", 3.0)]));
+        assert_eq!(halfway.powers, of(&[("p", 2.5), ("q", 6.0)]));
+        assert_eq!(halfway.starts, [[start(&[3.0]), start(&[1.0, 1.0])]]);
     }
 }
