@@ -52,6 +52,66 @@ pub fn diagnose(folder: &Path, product: &Value) -> Value {
     d
 }
 
+/// Simulates without keeping the truth, and calibrates.
+///
+/// # Panics
+/// A program fails.
+#[must_use]
+pub fn calibrated(folder: &Path, arguments: &[&str]) -> Value {
+    let file = simulate(folder, arguments).remove(0);
+    std::fs::remove_dir_all(folder.join("truth")).expect("removable");
+    let run = science_mode(folder).arg(&file).output().expect("runs");
+    serde_json::from_slice(&run.stdout).expect("a product as JSON")
+}
+
+/// Simulates, calibrates and diagnoses.
+///
+/// # Panics
+/// As [`diagnose`].
+#[must_use]
+pub fn diagnosis(arguments: &[&str]) -> Value {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    diagnose(folder.path(), &calibrated(folder.path(), arguments))
+}
+
+/// Accepted candidates.
+///
+/// # Panics
+/// There is no list of them.
+#[must_use]
+pub fn accepted(d: &Value) -> Vec<String> {
+    let name = |c: &Value| format!("{}:{}", c["effect"].as_str().unwrap_or("?"), c["instance"].as_str().unwrap_or("?"));
+    d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).map(name).collect()
+}
+
+/// The only accepted candidate, with its value within 4σ of `truth` (false alarm 6e-5).
+///
+/// # Panics
+/// Another is accepted too, or the value is further off.
+#[must_use]
+pub fn named_alone(d: &Value, truth: f64) -> String {
+    let found = accepted(d);
+    let [one] = &found[..] else { panic!("{found:?}: {:#}", d["candidates"]) };
+    let first = &d["candidates"][0];
+    let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
+    assert!((value - truth).abs() < 4.0 * sigma && sigma < 0.25 * truth.abs(), "{one} {value} ± {sigma}");
+    one.clone()
+}
+
+/// A readout scale or an electrode gain of 5 % along y, which confound each other, in so many hours of seed 31: one is
+/// named alone, the other is its confounder.
+///
+/// # Panics
+/// It is otherwise.
+pub fn scale_or_gain(hours: &str, effect: &str) {
+    let pair = ["is-scale:tm2.y", "es-gain:tm2.y"];
+    let d = diagnosis(&["--hours", hours, "--seed", "31", "--effect", &format!("{effect}=0.05")]);
+    let named = named_alone(&d, 0.05);
+    let confounders: Vec<_> = d["candidates"][0]["confounders"].as_array().expect("a list").iter().collect();
+    let other = pair.iter().find(|name| **name != named);
+    assert!(pair.contains(&&*named) && confounders.iter().any(|c| other == c.as_str().as_ref()), "{d:#}");
+}
+
 /// The bundled mission with changed texts, in `folder`.
 ///
 /// # Panics
