@@ -1,6 +1,6 @@
 //! Calibrations of simulated telemetry: run, result and truth.
 
-use crate::{dragfree, fixture};
+use crate::{dragfree, fixture, simulate};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,9 +1,10 @@
 //! `dragfree diagnose` on telemetry whose hidden cause no input of the program contains.
 
-use dragfree_tests::calibration::{accepted, calibrated, diagnose, diagnosis, named_alone, scale_or_gain};
+use dragfree_tests::calibration::{
+    accepted, calibrated, diagnose, diagnosis, named_alone, scale_or_gain, science_mode,
+};
 use dragfree_tests::{dragfree, expect, fixture, simulate};
 use serde_json::Value;
-use std::path::Path;
 
 /// Without a hidden effect nothing is named, among ten thousand forms (false-alarm rate 1 %, stated in the answer).
 #[test]
