@@ -475,3 +475,22 @@ fn an_absent_gain_inside_the_loop_is_estimated_as_zero() {
     let (value, sigma) = (gain["value"].as_f64().expect("a value"), gain["sigma"].as_f64().expect("a sigma"));
     assert!(value.abs() < 4.0 * sigma && sigma < 0.04, "{value} ± {sigma}");
 }
+
+/// A crosstalk of the readout of 0.5, more than twice the end of its range: it is refused, and so is what is like it and
+/// would be named in its place, with the name and the size of what explains more.
+#[test]
+fn what_stands_in_for_an_effect_outside_its_range_is_refused() {
+    let d = diagnosis(&["--hours", "3", "--seed", "9508", "--effect", "is-crosstalk:tm1.y-z=0.5"]);
+    assert_eq!((d["verdict"].as_str(), accepted(&d)), (Some("unexplained"), Vec::new()), "{:#}", d["candidates"]);
+    let all = d["candidates"].as_array().expect("a list");
+    let refused: Vec<&str> = all.iter().filter_map(|c| c["refused"].as_str()).collect();
+    let stands_in = |why: &&str| why.starts_with("is-crosstalk:tm1.y-z explains more in its place, with ");
+    let sizes: Vec<f64> = refused
+        .iter()
+        .filter(|why| stands_in(why))
+        .filter_map(|why| why.split("with ").nth(1)?.split([' ', ',']).next()?.parse().ok())
+        .collect();
+    assert!(!sizes.is_empty() && sizes.iter().all(|size| (size - 0.5).abs() < 0.02), "{refused:#?}");
+    let own = all.iter().find(|c| c["instance"] == "tm1.y-z" && c["effect"] == "is-crosstalk").expect("the true one");
+    assert_eq!(own["refused"], "its best value lies outside its physical range");
+}
