@@ -211,18 +211,22 @@ fn files_below(folder: &Path) -> Vec<PathBuf> {
     entries.flat_map(of).filter(|path| path.extension().is_some_and(|e| e == "rs")).collect()
 }
 
-/// A file of tests that is no module of `programs.rs` and no binary of its own would never run.
+/// A file of tests that is no module of `programs.rs` or `long.rs` and no binary of its own would never run.
 #[test]
 fn every_file_of_whole_program_tests_is_run() {
     let folder = dragfree_tests::root().join("tests");
-    let programs = std::fs::read_to_string(folder.join("tests/programs.rs")).expect("the list");
+    let list = |name: &str| std::fs::read_to_string(folder.join("tests").join(name)).expect("the list");
+    let modules = list("programs.rs") + &list("long.rs");
     let manifest = std::fs::read_to_string(folder.join("Cargo.toml")).expect("a manifest");
     let mut seen = 0;
     for path in std::fs::read_dir(folder.join("tests")).expect("a folder").flatten().map(|entry| entry.path()) {
         let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
-        let is_module = programs.lines().any(|line| line == format!("mod {name};"));
+        let is_module = modules.lines().any(|line| line == format!("mod {name};"));
         let is_binary = manifest.contains(&format!("[[test]]\nname = \"{name}\"\n"));
-        assert!(is_module != is_binary, "{name}: once in tests/tests/programs.rs, or in tests/Cargo.toml");
+        assert!(
+            is_module != is_binary,
+            "{name}: once in programs.rs or long.rs of tests/tests, or in tests/Cargo.toml"
+        );
         seen += 1;
     }
     assert!(seen > 30, "{seen}");

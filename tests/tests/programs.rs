@@ -1,8 +1,8 @@
 //! The whole-program tests in one binary: linked once, on all cores until the last one ends. Each file is a module, so
 //! that `cargo test --release -p dragfree-tests --test programs traps` runs the tests of `traps.rs`.
 //!
-//! `diagnosis.rs` and `foreign.rs`, which take longest, are binaries of their own. A file that is in neither place is
-//! found by `architecture.rs`.
+//! `diagnosis.rs` and `foreign.rs`, which take longest, are binaries of their own, and so is `long.rs`, which runs only
+//! where it is asked for. A file that is in none of these places is found by `architecture.rs`.
 
 mod abi_v1;
 mod accelerometer;
@@ -32,7 +32,6 @@ mod loop_gains;
 mod many_days;
 mod missions;
 mod model;
-mod next;
 mod noise_effects;
 mod operations;
 mod over_time;
