@@ -339,8 +339,8 @@ fn an_absent_gain_inside_the_loop_is_estimated_as_zero() {
     assert!(value.abs() < 4.0 * sigma && sigma < 0.04, "{value} ± {sigma}");
 }
 
-/// A crosstalk of the readout of 0.5, more than twice the end of its range: it is refused, and so is what is like it and
-/// would be named in its place, with the name and the size of what explains more.
+/// A crosstalk of the readout of 0.5, more than twice the end of its range: it is refused, and so is what is like it
+/// and would be named in its place, with the name and the size of what explains more.
 #[test]
 fn what_stands_in_for_an_effect_outside_its_range_is_refused() {
     let d = diagnosis(&["--hours", "3", "--seed", "9508", "--effect", "is-crosstalk:tm1.y-z=0.5"]);

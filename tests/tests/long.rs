@@ -1,6 +1,6 @@
-//! Tests that take a minute and more each, a quarter of an hour together: `cargo test --release -p dragfree-tests --test
-//! long`. `cargo test` without this name leaves them out (Cargo.toml). They are to pass before a release, and with every
-//! change of what a diagnosis says.
+//! Tests that take a minute and more each, a quarter of an hour together:
+//! `cargo test --release -p dragfree-tests --test long`. `cargo test` without this name leaves them out (Cargo.toml).
+//! They are to pass before a release, and with every change of what a diagnosis says.
 
 mod long_diagnoses;
 mod next;

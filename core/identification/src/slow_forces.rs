@@ -53,9 +53,9 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
 }
 
 /// Slow forces without those that one of `candidates`, or one of the `driven` ones, explains better. Each of the driven
-/// ones comes with the response of the place where it acts; they are the best of so many functions that were `tried`. A
-/// random walk whose power is made to fit takes what drifts evenly, and beside it the cause that acts would explain next
-/// to nothing.
+/// ones comes with the response of the place where it acts; they are the best of so many functions that were `tried`.
+/// A random walk whose power is made to fit takes what drifts evenly, and beside it the cause that acts would explain
+/// next to nothing.
 ///
 /// # Errors
 /// The declared noise and the slow forces contradict each other.
