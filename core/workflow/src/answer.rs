@@ -71,6 +71,11 @@ fn leading(fitted: &Fitted) -> (Vec<(f64, f64)>, usize) {
     (values, lead)
 }
 
+/// A unit as it stands after a number: nothing for a pure number.
+fn after_a_number(unit: &str) -> String {
+    if unit == "1" { String::new() } else { format!(" {unit}") }
+}
+
 fn coefficient(decided: &Decided, parameter: usize) -> (&str, &str) {
     match &decided.parameters[parameter] {
         (name, Meaning::Coefficient(c)) => (name, &c.unit),
@@ -174,11 +179,9 @@ pub(crate) fn refuse_stand_ins(
     for c in &set {
         let Some(outside) = decided.quadratic.stands_in_for(*c, &set, range, more) else { continue };
         let other = &decided.candidates[outside.candidate];
-        let size = |k: &usize| outside.free[*k].abs() / outside.covariance[(*k, *k)].sqrt();
-        let lead = (0..outside.free.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0);
+        let (values, lead) = leading(&Fitted { values: outside.free.clone(), ..outside });
         let (_, unit) = coefficient(decided, other.parameters[lead]);
-        let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
-        let (name, value) = (evidence.name_of(other), outside.free[lead]);
+        let (name, value, unit) = (evidence.name_of(other), values[lead].0, after_a_number(unit));
         let why = format!("{name} explains more in its place, with {value:.2e}{unit}, outside its physical range");
         let place = &decided.candidates[*c];
         let is_it = |f: &mut Found| (&f.effect, &f.instance) == (&place.effect, &place.instance);
@@ -461,7 +464,7 @@ pub(crate) fn drifting(drift: &Drift, settings: &Settings, decided: &Decided) ->
     if is_level && (at_end / at_start).ln().abs() < settings.level_tolerance.ln_1p() {
         return None;
     }
-    let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+    let unit = after_a_number(unit);
     let what = if is_level { format!("the level of {coefficient}") } else { coefficient.clone() };
     let others = match &confounders[..] {
         [] => String::new(),

@@ -843,7 +843,7 @@ fn what_is_like_a_value_outside_its_range_stands_in_for_it() {
     let set: Vec<usize> = near.select(&evidence(2)).chosen.iter().map(|f| f.candidate).collect();
     assert_eq!(set, [0, 2]);
     assert!(set.iter().all(|c| near.stands_in_for(*c, &set, range, more).is_none()));
-    // Weighed with the range as wide as it is, the second would be named.
+    // Where a range has no end, nothing is outside of it.
     assert!(far.stands_in_for(1, &[1, 2], f64::INFINITY, more).is_none());
 }
 
