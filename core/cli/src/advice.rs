@@ -2,6 +2,7 @@
 
 use chrono::DateTime;
 use dragfree_workflow::next::{Advice, Expected, Hour, LimitAdvice, Next, OfArchive, Planned};
+use dragfree_workflow::words::after_a_number;
 use std::fmt::Write as _;
 
 use crate::text::labelled;
@@ -57,7 +58,7 @@ fn limit(out: &mut String, a: &LimitAdvice, next: &Next) {
 }
 
 fn coefficient(out: &mut String, c: &Expected, then: &str) {
-    let unit = if c.unit == "1" { String::new() } else { format!(" {}", c.unit) };
+    let unit = after_a_number(&c.unit);
     let text = format!("{} ± {:.1e}{unit} now, ± {:.1e}{unit} {then}", c.name, c.sigma_now, c.sigma_expected);
     *out += &line("", &text);
 }

@@ -17,6 +17,7 @@ use serde_json::json;
 
 use crate::likelihood::{Decided, Judge, LEVEL_PRIOR, Meaning, Place};
 use crate::proposals::Proposal;
+use crate::words::after_a_number;
 
 /// Corrected p-values of the effects of some products.
 pub(crate) struct Evidence<'a> {
@@ -69,11 +70,6 @@ fn leading(fitted: &Fitted) -> (Vec<(f64, f64)>, usize) {
     let size = |k: &usize| (values[*k].0 / values[*k].1).abs();
     let lead = (0..values.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0);
     (values, lead)
-}
-
-/// A unit as it stands after a number: nothing for a pure number.
-fn after_a_number(unit: &str) -> String {
-    if unit == "1" { String::new() } else { format!(" {unit}") }
 }
 
 fn coefficient(decided: &Decided, parameter: usize) -> (&str, &str) {
@@ -166,27 +162,12 @@ pub(crate) fn found(
     }
 }
 
-/// Refuses what is named in the place of an effect that the data want outside of its physical range: that one is
-/// refused, and what is like it takes its place.
-pub(crate) fn refuse_stand_ins(
-    (named, others): (&mut Vec<Found>, &mut Vec<Found>),
-    decided: &Decided,
-    evidence: &Evidence<'_>,
-    settings: &Settings,
-) {
-    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
-    let (range, more) = (settings.range_sigmas.powi(2), -settings.false_alarm.ln());
-    for c in &set {
-        let Some(outside) = decided.quadratic.stands_in_for(*c, &set, range, more) else { continue };
-        let other = &decided.candidates[outside.candidate];
-        let (values, lead) = leading(&Fitted { values: outside.free.clone(), ..outside });
-        let (_, unit) = coefficient(decided, other.parameters[lead]);
-        let (name, value, unit) = (evidence.name_of(other), values[lead].0, after_a_number(unit));
-        let why = format!("{name} explains more in its place, with {value:.2e}{unit}, outside its physical range");
-        let place = &decided.candidates[*c];
-        let is_it = |f: &mut Found| (&f.effect, &f.instance) == (&place.effect, &place.instance);
-        others.extend(named.extract_if(.., is_it).map(|f| Found { accepted: false, refused: Some(why.clone()), ..f }));
-    }
+/// Name of a candidate, and the most significant of its values without ranges, with its unit.
+pub(crate) fn a_value(fitted: &Fitted, decided: &Decided, evidence: &Evidence<'_>) -> (String, String) {
+    let place = &decided.candidates[fitted.candidate];
+    let (values, lead) = leading(&Fitted { values: fitted.free.clone(), ..fitted.clone() });
+    let (_, unit) = coefficient(decided, place.parameters[lead]);
+    (evidence.name_of(place), format!("{:.2e}{}", values[lead].0, after_a_number(unit)))
 }
 
 /// Gives a named effect the form and the values that it has where the numbers in its form are fitted.
@@ -406,15 +387,6 @@ fn channels_of(record: &Record, component: &str) -> Vec<String> {
         p.enters.iter().filter(move |(_, gains)| gains[k] != 0.0).map(|(channel, _)| channel.clone())
     })
     .collect()
-}
-
-/// Where nothing is named, the reasons for which what is significant is refused.
-pub(crate) fn why_none_is_named(named: &[Found], others: &[Found]) -> Vec<String> {
-    let refused = |f: &Found| {
-        let reason = f.refused.as_ref()?;
-        Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
-    };
-    if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() }
 }
 
 /// What is missing, by what is named and whether something is left.

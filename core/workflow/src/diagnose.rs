@@ -12,8 +12,6 @@ use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
-use dragfree_identification::distributions::ln_chi2_above;
-use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
@@ -25,15 +23,15 @@ use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{
-    Evidence, apart, contradict, drifting, fit_form, found, limits, noise_levels, offsets, refuse_stand_ins, verdict,
-    why_none_is_named, with_levels,
+    Evidence, apart, contradict, drifting, fit_form, limits, noise_levels, offsets, verdict, with_levels,
 };
 use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{
-    Decided, How, Judge, PASSES, Place, Point, Reached, Settled, moved, one_pass, settle, step, step_of_model,
-    transients_near_ends, with_numbers,
+    Decided, How, PASSES, Point, Reached, Settled, moved, one_pass, settle, step, step_of_model, transients_near_ends,
+    with_numbers,
 };
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
+use crate::refusals::Answers;
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
@@ -462,53 +460,24 @@ fn answer(
 ) -> Result<Diagnosis, WorkflowError> {
     let forms = &screened.forms;
     let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
-    let mut named: Vec<Found> =
-        decided.selection.chosen.iter().map(|f| found(settings, decided, f, evidence, true)).collect();
-    let mut others: Vec<Found> =
-        decided.selection.rest.iter().map(|f| found(settings, decided, f, evidence, false)).collect();
-    refuse_stand_ins((&mut named, &mut others), decided, evidence, settings);
-    let is_formula = |f: &Found| evidence.proposal(&f.effect, &f.instance).is_some();
-    let mut formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
-    others.retain(|f| !is_formula(f));
-    for (f, rivals) in not_told_from_formulas(settings, decided, evidence) {
-        let is_it = |own: &mut Found| (&own.effect, &own.instance) == (&f.effect, &f.instance);
-        for own in named.extract_if(.., is_it) {
-            let words = |f: &Found| evidence.proposal(&f.effect, &f.instance).map(|p| p.words.clone());
-            let names: Vec<String> = rivals.iter().filter_map(words).chain(own.confounders.iter().cloned()).collect();
-            let refused = Some(format!("these data do not tell it from {}", first_few(&names)));
-            others.push(Found { accepted: false, refused, ..own });
-        }
-        formulas.extend(rivals);
-    }
-    for place in followed_by_formulas(decided, evidence) {
-        let is_it = |own: &mut Found| (&own.effect, &own.instance) == (&place.effect, &place.instance);
-        for own in named.extract_if(.., is_it) {
-            let refused = "formulas are needed beside it, which explain the greater part of what it explains, and more";
-            others.push(Found { accepted: false, refused: Some(refused.to_owned()), ..own });
-        }
-    }
-    let is_slow = |own: &Found| {
+    let mut answers = Answers::new(settings, decided, evidence);
+    answers.refuse_stand_ins(decided, evidence, settings);
+    let mut formulas = answers.take_formulas(evidence);
+    formulas.extend(answers.refuse_like_formulas(settings, decided, evidence));
+    answers.refuse_beside_formulas(decided, evidence);
+    answers.refuse_parts_of_formulas(&formulas, |own| {
         let form = forms.iter().find(|f| !f.transient && (&f.effect, &f.instance) == (&own.effect, &own.instance));
         form.is_some_and(|form| form.is_slow(&record.gathered.columns))
-    };
-    for own in named.extract_if(.., |own| is_slow(own) && is_part_of_one(own, &formulas)) {
-        let refused = "a force that no effect states acts there and explains more: it may be a part of that";
-        others.push(Found { accepted: false, refused: Some(refused.to_owned()), ..own });
-    }
+    });
     // A small remainder of what was there without them is what the grid of forms cannot represent.
     let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
     let loud = unexplained.as_ref().filter(|u| u.ratio > settings.excess_remainder * before);
-    let doubtful = follows_an_excess(scorer, &named_forms(decided, forms), loud)?;
-    for f in named.extract_if(.., |f| doubtful.contains(&(f.effect.clone(), f.instance.clone()))) {
-        let channels = unexplained.as_ref().map_or_else(String::new, |u| u.channels.join(", "));
-        let refused = Some(format!("with it {channels} still show what no effect explains"));
-        others.push(Found { accepted: false, refused, ..f });
-    }
+    answers.refuse_followers(scorer, &named_forms(decided, forms), loud)?;
     let unexplained = followed(unexplained, &formulas, evidence, scorer);
     let levels = noise_levels(decided, record, evidence, settings);
-    let levels = with_levels(&mut named, &levels, decided, evidence, settings);
-    others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
-    let mut reasons = why_none_is_named(&named, &others);
+    let levels = with_levels(&mut answers.named, &levels, decided, evidence, settings);
+    answers.sort_others();
+    let mut reasons = answers.why_none_is_named();
     if !moving.is_empty() {
         let names: Vec<&str> = moving.iter().map(String::as_str).collect();
         reasons.push(format!("the likelihood is not settled after {PASSES} passes: {} still move", names.join(", ")));
@@ -517,9 +486,7 @@ fn answer(
     reasons.extend(apart(agreement.as_ref(), settings));
     let drifts = decided.drifts(settings, evidence);
     reasons.extend(drifts.iter().filter_map(|drift| drifting(drift, settings, decided)));
-    let verdict = verdict(&named, unexplained.is_some() || !reasons.is_empty());
-    others.truncate(settings.max_evaluated);
-    named.extend(others);
+    let verdict = verdict(&answers.named, unexplained.is_some() || !reasons.is_empty());
     let beside_constants = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
     let unobservable = screened.unobservable.iter().cloned().chain(beside_constants);
     let unobservable = unobservable.map(|name| (name, UNOBSERVABLE.to_owned()));
@@ -527,7 +494,7 @@ fn answer(
         verdict: verdict.to_owned(),
         false_alarm_rate: settings.false_alarm,
         tried: evidence.trials.total(),
-        candidates: named,
+        candidates: answers.into_candidates(settings.max_evaluated),
         upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
         unexplained,
         formulas,
@@ -542,75 +509,6 @@ fn answer(
             .chain(decided.not_tried.iter().cloned())
             .collect(),
     })
-}
-
-/// The first three names of a list, and how many there are besides.
-fn first_few(names: &[String]) -> String {
-    let few = names.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
-    if names.len() > 3 { format!("{few} and {} more", names.len() - 3) } else { few }
-}
-
-/// What is named, and may as well be a force that no effect knows: the probability of that is above the false-alarm
-/// rate, or a formula with fewer coefficients explains as much but for what the further ones explain by chance. With
-/// the formulas that state such forces, the most probable first.
-fn not_told_from_formulas<'a>(
-    settings: &Settings,
-    decided: &'a Decided,
-    evidence: &Evidence<'_>,
-) -> Vec<(&'a Place, Vec<Found>)> {
-    let place = |c: usize| &decided.candidates[c];
-    let is_formula = |c: usize| evidence.proposal(&place(c).effect, &place(c).instance).is_some();
-    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
-    let rivals = |f: &'a Fitted| {
-        let probable = f.alternatives.iter().filter(|(c, _)| is_formula(*c));
-        let doubtful = probable.clone().map(|(_, p)| p).sum::<f64>() > settings.false_alarm;
-        let mut formulas: Vec<usize> =
-            probable.filter(|(_, p)| doubtful && *p > settings.false_alarm).map(|(c, _)| *c).collect();
-        let others: Vec<usize> = set.iter().copied().filter(|c| *c != f.candidate).collect();
-        let fitted = |c: usize| decided.quadratic.beside(c, &others);
-        let more = place(f.candidate).parameters.len() - 1;
-        let is_simpler = |c: &usize| more > 0 && is_formula(*c) && !set.contains(c) && !formulas.contains(c);
-        let by_chance = |lost: f64| ln_chi2_above(lost.max(0.0), more as f64) > settings.false_alarm.ln();
-        let simpler = (0..decided.candidates.len()).filter(is_simpler).map(|c| (c, fitted(c).gain));
-        let as_good = simpler.filter(|(_, gain)| by_chance(f.gain - gain));
-        let ln_prior = |p: &Place| evidence.ln_prior(&p.effect, &p.instance, p.family());
-        let ln_weight = |(c, gain): (usize, f64)| 0.5 * gain + ln_prior(place(c));
-        let mut as_good: Vec<(usize, f64)> = as_good.map(|own| (own.0, ln_weight(own))).collect();
-        as_good.sort_by(|a, b| b.1.total_cmp(&a.1));
-        let least = as_good.first().map_or(0.0, |best| best.1 + settings.false_alarm.ln());
-        formulas.extend(as_good.into_iter().filter(|(_, weight)| *weight > least).map(|(c, _)| c));
-        // Each is as good as the other: nothing speaks against it.
-        let formula = |c: usize| Found { refused: None, ..found(settings, decided, &fitted(c), evidence, false) };
-        let all: Vec<Found> = formulas.into_iter().take(settings.max_evaluated).map(formula).collect();
-        (!all.is_empty()).then(|| (place(f.candidate), all))
-    };
-    decided.selection.chosen.iter().filter(|f| !is_formula(f.candidate)).filter_map(rivals).collect()
-}
-
-/// Whether an effect acts where a formula explains more.
-fn is_part_of_one(own: &Found, formulas: &[Found]) -> bool {
-    let shares = |f: &Found| f.channels.iter().any(|channel| own.channels.contains(channel));
-    formulas.iter().any(|f| shares(f) && f.delta_chi2 > own.delta_chi2)
-}
-
-/// What is chosen together with formulas, of which formulas explain the greater part, and more than it explains without
-/// them: of an unknown force it is one of the series that resemble it together, as they are.
-fn followed_by_formulas<'a>(decided: &'a Decided, evidence: &Evidence<'_>) -> Vec<&'a Place> {
-    let place = |c: usize| &decided.candidates[c];
-    let is_formula = |c: &usize| evidence.proposal(&place(*c).effect, &place(*c).instance).is_some();
-    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
-    let (formulas, effects): (Vec<usize>, Vec<usize>) = set.iter().copied().partition(is_formula);
-    if formulas.is_empty() {
-        return Vec::new();
-    }
-    let follows = |c: &usize| {
-        let others: Vec<usize> = effects.iter().copied().filter(|other| other != c).collect();
-        let gain = |more: &[usize]| decided.quadratic.gain(&[&others[..], more].concat());
-        let (none, alone, by_formulas) = (gain(&[]), gain(&[*c]), gain(&formulas));
-        let own = decided.quadratic.gain(&set) - by_formulas;
-        own < 0.5 * (alone - none) && by_formulas > alone
-    };
-    effects.iter().filter(|c| follows(c)).map(|c| place(*c)).collect()
 }
 
 /// What is unexplained, with the drivers of the proposed formulas first among what is coherent with it.
@@ -651,26 +549,6 @@ fn followed(
     u.channels.sort();
     u.channels.dedup();
     Some(u)
-}
-
-/// Named effects that act where more power than the noise is left with them, in the bands that say most about them:
-/// they follow the cause of that power, and are not it.
-fn follows_an_excess(
-    scorer: &CandidateScorer<'_>,
-    named: &[Candidate],
-    unexplained: Option<&Unexplained>,
-) -> Result<Vec<(String, String)>, WorkflowError> {
-    let Some(u) = unexplained.filter(|u| u.power) else { return Ok(Vec::new()) };
-    let fit = scorer.fit(named)?;
-    let Some(excess) = scorer.without_excess(&fit) else { return Ok(Vec::new()) };
-    let acts = |c: &&Candidate| {
-        let channels = &scorer.candidate_set.channels;
-        let mut own = c.parts.iter().flat_map(|(_, form)| &form.terms).map(|t| &channels[t.channel]);
-        own.any(|channel| u.channels.contains(channel))
-    };
-    let mostly = |c: &&Candidate| scorer.part_in(&excess.plain, c, &excess.bands) > 0.5;
-    let all = named.iter().filter(|c| !c.transient).filter(acts).filter(mostly);
-    Ok(all.map(|c| (c.effect.clone(), c.instance.clone())).collect())
 }
 
 impl Diagnosed {

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use dragfree_archive::{Archive, EXTRACT, Stamp, Written};
 use dragfree_engine::EngineError;
 use dragfree_identification::candidates::Candidate;
-use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
+use dragfree_identification::diagnosis::{Diagnosis, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;
 use dragfree_identification::record::Record;
 use dragfree_schema::{Coefficient, Settings};
@@ -21,10 +21,10 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use crate::answer::{
-    Evidence, NoiseLevel, Rival, apart, contradict, found, limits, offsets, refuse_stand_ins, rivals_of_all, verdict,
-    why_none_is_named, with_levels,
+    Evidence, NoiseLevel, Rival, apart, contradict, limits, offsets, rivals_of_all, verdict, with_levels,
 };
 use crate::likelihood::{CoefficientSums, Decided, Stretches, joined};
+use crate::refusals::Answers;
 use crate::{ManyDays, WorkflowError};
 
 mod by_band;
@@ -410,26 +410,22 @@ pub(crate) fn levels_of_all(days: &[&[NoiseLevel]]) -> Vec<NoiseLevel> {
 }
 
 fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence: &Evidence<'_>) -> Diagnosis {
-    let of = |accepted: bool| move |f| found(settings, decided, f, evidence, accepted);
-    let mut named: Vec<Found> = decided.selection.chosen.iter().map(of(true)).collect();
-    let mut others: Vec<Found> = decided.selection.rest.iter().map(of(false)).collect();
-    refuse_stand_ins((&mut named, &mut others), decided, evidence, settings);
+    let mut answers = Answers::new(settings, decided, evidence);
+    answers.refuse_stand_ins(decided, evidence, settings);
     let levels: Vec<&[NoiseLevel]> = extracts.iter().map(Extract::levels).collect();
-    let levels = with_levels(&mut named, &levels_of_all(&levels), decided, evidence, settings);
-    others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    let levels = with_levels(&mut answers.named, &levels_of_all(&levels), decided, evidence, settings);
+    answers.sort_others();
     let left = |e: &Extract| Some(format!("{} alone: {}", e.product, e.unexplained.as_ref()?));
     let agreement = decided.agreement();
-    let mut reasons = why_none_is_named(&named, &others);
+    let mut reasons = answers.why_none_is_named();
     reasons.extend(apart(agreement.as_ref(), settings));
     reasons.extend(extracts.iter().filter_map(left));
-    let verdict = verdict(&named, !reasons.is_empty());
-    others.truncate(settings.max_evaluated);
-    named.extend(others);
+    let verdict = verdict(&answers.named, !reasons.is_empty());
     Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: settings.false_alarm,
         tried: evidence.trials.total(),
-        candidates: named,
+        candidates: answers.into_candidates(settings.max_evaluated),
         upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
         unexplained: None,
         formulas: Vec::new(),

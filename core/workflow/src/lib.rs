@@ -21,6 +21,7 @@ pub mod over_time;
 mod proposals;
 pub mod provenance;
 pub mod refit;
+mod refusals;
 mod replay;
 pub mod residuals;
 mod sums;

@@ -32,6 +32,11 @@ pub fn readable_unit(unit: &str) -> (&str, f64) {
     }
 }
 
+/// A unit as it stands after a number: nothing for a pure number.
+pub fn after_a_number(unit: &str) -> String {
+    if unit == "1" { String::new() } else { format!(" {unit}") }
+}
+
 /// A value with its standard deviation, two digits of the latter: `90.912 ± 0.011`.
 pub fn measured(value: f64, sigma: f64) -> String {
     if !value.is_finite() {

@@ -13,6 +13,7 @@ use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
 use dragfree_workflow::extract::diagnose_extracts;
 use dragfree_workflow::next::{Next, next};
+use dragfree_workflow::words::after_a_number;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -202,7 +203,7 @@ fn put(out: &mut String, f: &Found, different: f64) {
         f.coefficient,
         f.value,
         f.sigma,
-        if f.unit == "1" { String::new() } else { format!(" {}", f.unit) },
+        after_a_number(&f.unit),
         f.delta_chi2,
         f.p_value,
         if f.in_range { "" } else { ", at the end of its range" }

@@ -478,17 +478,20 @@ impl Quadratic {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let with = |c: usize| [&others[..], &[c]].concat();
         let least = self.ln_evidence(set) + more;
-        let own = self.beside(candidate, set).gain;
-        let takes_most = |outside: usize| {
-            let gain = |all: &[usize]| self.fit_without_ranges_of(Some(outside), all).1;
-            let beside = with(outside);
-            gain(&[&beside[..], &[candidate]].concat()) - gain(&beside) < 0.5 * own
-        };
+        let takes_most = |outside: usize| self.explain_most_of(candidate, &others, &[outside], Some(outside));
         let left = (0..self.candidates.len()).filter(|c| !set.contains(c) && self.observable(*c, &others));
         let explains = left.map(|c| (c, self.ln_evidence(&with(c)))).filter(|(_, evidence)| *evidence > least);
         let outside = explains.map(|(c, evidence)| (self.beside(c, &others), evidence));
         let all = outside.filter(|(f, _)| f.beyond > range && takes_most(f.candidate));
         all.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(fitted, _)| fitted)
+    }
+
+    /// Whether `by` explain the greater part of what a candidate explains beside `others`: less than half of its gain
+    /// is left to it with them. The ranges of `outside`, which may be one of them, are left aside.
+    pub fn explain_most_of(&self, candidate: usize, others: &[usize], by: &[usize], outside: Option<usize>) -> bool {
+        let gain = |set: &[usize]| self.fit_without_ranges_of(outside, set).1;
+        let own = |beside: &[usize]| gain(&[beside, &[candidate]].concat()) - gain(beside);
+        own(&[others, by].concat()) < 0.5 * own(others)
     }
 
     /// The candidates.
