@@ -520,13 +520,13 @@ mod tests {
     /// A force that is the product of two of six housekeeping channels whose zeros are unknown is explained by them
     /// better than by a random walk, and one that follows none of them is not. Of 200 sets of nine hours (seeds 0 to
     /// 199) 195 are, and 13 of those in which the force follows none, as the best of so many functions resembles it by
-    /// chance. Of 40 sets with these rates fewer than 33, and more than 11, are with a probability of 6e-6 each.
+    /// chance. Of 40 others with these rates fewer than 33, and more than 11, are with a probability of 6e-6 each.
     #[test]
     fn a_driven_force_is_told_from_a_random_walk() {
         let (hours, size) = (9.0, 1e-14);
         let housekeeping = none(6);
         let (mut own, mut others) = (0, 0);
-        for seed in 0..40 {
+        for seed in 200..240 {
             let walks: Vec<_> = (0..7).map(|k| random_walk(5000 + 10 * seed + k, hours)).collect();
             let series: Vec<&dyn Fn(f64) -> f64> = walks[..6].iter().map(|w| w as &dyn Fn(f64) -> f64).collect();
             let is_explained = |force: &dyn Fn(f64) -> f64| {
