@@ -6,6 +6,11 @@ use dragfree_tests::calibration::{
 use dragfree_tests::{dragfree, expect, fixture};
 use serde_json::Value;
 
+/// Whether a proposed formula has the battery's current in it.
+fn is_by_the_current(formula: &Value) -> bool {
+    formula["shape"]["expression"].as_str().is_some_and(|text| text.contains("hk.battery_current_a"))
+}
+
 /// A thruster gain of 10 % is named alone at any length.
 #[test]
 fn a_thruster_gain_is_named_from_six_to_twelve_hours() {
@@ -42,9 +47,8 @@ fn a_delay_of_the_capacitive_readouts_is_named_alone() {
 fn six_coefficients_are_not_named_where_one_explains_as_much() {
     let d = diagnosis(&["--hours", "24", "--seed", "9204", "--effect", "product-force:tm2.x=2e-13"]);
     assert_eq!((d["verdict"].as_str(), accepted(&d)), (Some("unexplained"), Vec::new()), "{:#}", d["candidates"]);
-    let expression = |f: &Value| f["shape"]["expression"].as_str().is_some_and(|e| e.contains("hk.battery_current_a"));
     let formulas = d["formulas"].as_array().expect("a list");
-    assert!(formulas.iter().take(3).any(expression), "{formulas:#?}");
+    assert!(formulas.iter().take(3).any(is_by_the_current), "{formulas:#?}");
 }
 
 /// Sets of two hours in which a thermal force was named that does not act, with 143 and 37 of χ²: beside what is named
@@ -111,8 +115,7 @@ fn an_effect_is_not_named_where_an_unknown_force_explains_as_much() {
     assert_eq!((d["verdict"].as_str(), accepted(&d)), (Some("unexplained"), Vec::new()), "{:#}", d["candidates"]);
     let formulas = d["formulas"].as_array().expect("a list");
     assert!(formulas.iter().all(|f| f["shape"]["acts_on"] == "tm1.accel.x") && !formulas.is_empty(), "{formulas:#?}");
-    let expression = |f: &Value| f["shape"]["expression"].as_str().is_some_and(|e| e.contains("hk.battery_current_a"));
-    assert!(formulas.iter().take(3).any(expression), "{formulas:#?}");
+    assert!(formulas.iter().take(3).any(is_by_the_current), "{formulas:#?}");
     let refused = d["candidates"].as_array().expect("a list").iter().filter(|c| c["refused"].is_string());
     let reason = |c: &Value| c["refused"].as_str().unwrap_or_default().contains("these data do not tell it from");
     assert!(refused.clone().all(reason), "{:#?}", refused.collect::<Vec<_>>());

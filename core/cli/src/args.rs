@@ -514,7 +514,7 @@ pub(crate) struct Diagnose {
     pub(crate) archive: Archive,
     #[command(flatten)]
     pub(crate) inputs: Inputs,
-    /// Candidates and limits to print; --json has all
+    /// Candidates to print, the named ones among them; --json has all, with limits
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
     /// Write what --json prints to a file, too: `model add --from` and `reveal --diagnosis` read it

@@ -162,12 +162,13 @@ pub(crate) fn found(
     }
 }
 
-/// Name of a candidate, and the most significant of its values without ranges, with its unit.
+/// Name of a candidate, and the most significant of its values without ranges, with σ and unit.
 pub(crate) fn a_value(fitted: &Fitted, decided: &Decided, evidence: &Evidence<'_>) -> (String, String) {
     let place = &decided.candidates[fitted.candidate];
     let (values, lead) = leading(&Fitted { values: fitted.free.clone(), ..fitted.clone() });
     let (_, unit) = coefficient(decided, place.parameters[lead]);
-    (evidence.name_of(place), format!("{:.2e}{}", values[lead].0, after_a_number(unit)))
+    let (value, sigma) = values[lead];
+    (evidence.name_of(place), format!("{value:.2e} ± {sigma:.1e}{}", after_a_number(unit)))
 }
 
 /// Gives a named effect the form and the values that it has where the numbers in its form are fitted.

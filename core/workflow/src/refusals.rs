@@ -279,7 +279,7 @@ mod tests {
         let says = |words: &str| reasons.iter().any(|reason| reason.contains(words));
         assert!(reasons.len() == 2 && says("like-it:sc would lower χ²"), "{reasons:?}");
         assert!(
-            says("large:sc explains more in its place, with 5.00e-1 rad, outside its physical range"),
+            says("large:sc explains more in its place, with 5.00e-1 ± 1.0e-2 rad, outside its physical range"),
             "{reasons:?}"
         );
         assert!(says("large:sc would lower χ²") && says("its best value lies outside its physical range"));

@@ -202,10 +202,9 @@ fn summary(diagnosis: &Value) -> String {
         let (unit, factor) = text::readable_unit(found["unit"].as_str().unwrap_or_default());
         let size = text::measured(number(&found["value"]) * factor, number(&found["sigma"]) * factor);
         let size = format!("{size} {unit}");
-        let (fall, chance) = (number(&found["delta_chi2"]), number(&found["p_value"]));
+        let (fall, p) = (number(&found["delta_chi2"]), number(&found["p_value"]));
         let name = format!("{}:{}", word(&found["effect"]), word(&found["instance"]));
-        lines +=
-            &labelled("missing", &format!("{name} = {}, χ² falls by {fall:.0}, chance {chance:.1e}", size.trim_end()));
+        lines += &labelled("missing", &format!("{name} = {}, χ² falls by {fall:.0}, p {p:.1e}", size.trim_end()));
         for (name, sigmas) in found["offset_shift_sigma"].as_object().into_iter().flatten() {
             let (shift_mm, sigmas) = (1e3 * number(&found["offset_shift_m"][name]), number(sigmas));
             if sigmas.abs() > 1.0 {

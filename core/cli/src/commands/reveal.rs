@@ -64,7 +64,10 @@ fn verdict(score: &Score, paint: Paint) -> String {
         Verdict::Confounded => ("confounded", "what is hidden is named as what the data cannot tell from the accepted"),
         Verdict::Wrong => ("wrong", "a cause that did not act is accepted in place of what is hidden"),
         Verdict::Missed => ("missed", "what is hidden is not found"),
-        Verdict::FalseAlarm => ("false alarm", "something that did not act is accepted, or called unexplained"),
+        Verdict::FalseAlarm if score.effects.is_empty() => {
+            ("false alarm", "nothing is hidden, and the model is not sufficient")
+        }
+        Verdict::FalseAlarm => ("false alarm", "what is hidden is found, and a cause that did not act is accepted too"),
         Verdict::Unexplained if score.correct => ("unexplained", "rightly: no installed effect covers what is hidden"),
         Verdict::Unexplained => ("unexplained", "something is hidden; its cause is not named"),
     };
