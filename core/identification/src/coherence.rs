@@ -83,6 +83,13 @@ pub struct Coherence {
     pub band_hz: [f64; 2],
 }
 
+impl Coherence {
+    /// Probability of as much by chance, corrected for what was tried.
+    pub fn p_value(&self) -> f64 {
+        corrected(ln_chi2_above(self.statistic, self.dof).exp(), self.trials)
+    }
+}
+
 /// Drivers that are coherent with a channel's residual, each given those before it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StepwiseCoherence {
@@ -246,11 +253,31 @@ impl HousekeepingCoherence {
         }
     }
 
-    /// Adds the sums of other segments with the same housekeeping.
-    pub fn add(&mut self, other: &Self) {
-        if self.names != other.names || self.bands != other.bands {
-            return;
+    /// With products and squares about the values of other data to which these will be added: about values of their own
+    /// they would be other functions.
+    #[must_use]
+    pub fn about(mut self, levels: &[f64]) -> Self {
+        if levels.len() == self.level.len() {
+            self.level.copy_from_slice(levels);
         }
+        self
+    }
+
+    /// Values of housekeeping about which products and squares are taken; not a number before any segment.
+    pub fn levels(&self) -> &[f64] {
+        &self.level
+    }
+
+    /// Whether the sums of other segments add to these: the same housekeeping in the same bands, about the same values.
+    pub fn is_like(&self, other: &Self) -> bool {
+        let about_one = |(a, b): (&f64, &f64)| a.is_nan() || b.is_nan() || a == b;
+        self.names == other.names && self.bands == other.bands && self.level.iter().zip(&other.level).all(about_one)
+    }
+
+    /// Adds the sums of other segments that [are like](Self::is_like) these.
+    pub fn add(&mut self, other: &Self) {
+        debug_assert!(self.is_like(other));
+        self.level.iter_mut().zip(&other.level).filter(|(own, _)| own.is_nan()).for_each(|(own, level)| *own = *level);
         self.residual_power += &other.residual_power;
         self.power += &other.power;
         self.cross.iter_mut().zip(&other.cross).for_each(|(a, b)| *a += b);
@@ -670,6 +697,16 @@ mod tests {
         known: Vec<String>,
         change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>]),
     ) -> (HousekeepingCoherence, Vec<String>) {
+        segments_about(seed, known, &[], change)
+    }
+
+    /// The same with products about some values.
+    fn segments_about(
+        seed: u64,
+        known: Vec<String>,
+        levels: &[f64],
+        change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>]),
+    ) -> (HousekeepingCoherence, Vec<String>) {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let plan = Plan::new(1024, 1.0);
         let samples = 2 * plan.length;
@@ -684,7 +721,7 @@ mod tests {
         let mut places = Direction::of_channels(&[("", "ORF"); CHANNELS]);
         let response = DVector::from_fn(CHANNELS, |c, _| [-0.8, 0.6].get(c).copied().unwrap_or(0.0));
         places.push(Direction { name: "sc.force.x".to_owned(), frame: "SRF".to_owned(), response });
-        let mut coherence = HousekeepingCoherence::new(names, known, &plan, same, whitening, places);
+        let mut coherence = HousekeepingCoherence::new(names, known, &plan, same, whitening, places).about(levels);
         let mut transformer = Transformer::new(&plan);
         for first in (0..=samples - plan.length).step_by(plan.length / 2) {
             let cut = |x: &Vec<f64>| x[first..first + plan.length].to_vec();
@@ -773,6 +810,34 @@ mod tests {
         let parts = coherence.parts(place, driver, |_| Complex::new(1.0, 0.0), 0.0);
         let sum = |of: fn(&Part) -> f64| parts.iter().map(|p| 2.0 * p.observations / p.power * of(p)).sum::<f64>();
         (sum(|p| p.along) / sum(|p| p.squared), sum(|p| p.along).powi(2) / sum(|p| p.squared))
+    }
+
+    /// On two days whose housekeeping is 5σ apart a product of two acts, about the values of the first: it has its
+    /// amplitude of 3 within 4.4σ of 0.08 in the sum of both (false alarm 1e-5). About values of its own the second day
+    /// has another function: that does not add.
+    #[test]
+    fn products_of_several_days_are_about_the_same_values() {
+        let (seeds, product) = ([21, 22], Driver::Product(1, 2));
+        let day = |k: usize, levels: &[f64], about: [f64; 2]| {
+            let change = |channels: &mut [Vec<f64>], housekeeping: &mut [Vec<f64>]| {
+                housekeeping[1].iter_mut().for_each(|x| *x += 5.0 * k as f64);
+                let force = housekeeping[1].iter().zip(&housekeeping[2]);
+                let force: Vec<f64> = force.map(|(x, y)| 3.0 * (x - about[0]) * (y - about[1])).collect();
+                channels[0].iter_mut().zip(force).for_each(|(z, force)| *z += force);
+            };
+            segments_about(seeds[k], Vec::new(), levels, change).0
+        };
+        // The values of a day do not depend on its channels.
+        let levels = day(0, &[], [0.0; 2]).levels().to_vec();
+        let about = [levels[1], levels[2]];
+        let mut sum = day(0, &[], about);
+        let (second, about_its_own) = (day(1, &levels, about), day(1, &[], about));
+        assert!(sum.is_like(&second) && !sum.is_like(&about_its_own));
+        sum.add(&second);
+        let (amplitude, _) = told(&sum, 0, product);
+        assert!((amplitude - 3.0).abs() < 4.4 * 0.08, "{amplitude}");
+        let (amplitude, _) = told(&about_its_own, 0, product);
+        assert!((amplitude - 3.0).abs() > 4.4 * 0.08, "{amplitude}");
     }
 
     /// A force on the spacecraft enters two channels. At the place of the spacecraft it has its amplitude within 4.4σ

@@ -44,7 +44,7 @@ pub struct Cell {
     pub dof: f64,
 }
 
-/// A candidate_set to a channel.
+/// A test of a channel.
 #[derive(Clone, Debug, Serialize)]
 pub struct Test {
     /// * `level`: χ²/dof over all bands.
@@ -343,10 +343,8 @@ pub fn compare(
         })
         .collect();
     let all = gathered.housekeeping.coherences(names);
-    let trials = all.len() as f64;
-    let chance = |w: &Coherence| corrected(chi2_tails(w.statistic / w.dof, w.dof).1, trials);
     let passes = channels.iter().all(|c| c.passes);
-    let coherences = all.into_iter().map(|c| SignificantCoherence { p_value: chance(&c), coherence: c });
+    let coherences = all.into_iter().map(|c| SignificantCoherence { p_value: c.p_value(), coherence: c });
     Ok(Comparison {
         verdict: if passes { "passes" } else { "fails" },
         passes,

@@ -12,6 +12,7 @@ use crate::candidates::Candidate;
 use crate::coherence::Coherence;
 use crate::distributions::{corrected, ln_chi2_above};
 use crate::scores::{CandidateScorer, IdentificationError};
+use crate::transient::{Detection, Transients, is_one_transient};
 
 /// Standard normal quantile of a one-sided 95 % limit.
 pub const LIMIT_QUANTILE: f64 = 1.645;
@@ -139,11 +140,6 @@ impl Constancy {
 }
 
 impl Found {
-    /// Of a level of noise: whether it differs from the stated one for certain, and by more than a mission file's may.
-    pub fn standing(&self, settings: &Settings) -> (bool, bool) {
-        (self.p_value < settings.false_alarm, self.value.ln().abs() > settings.level_tolerance.ln_1p())
-    }
-
     /// As a level that is told and is no cause.
     pub fn level(&self) -> OtherLevel {
         let (effect, instance) = (self.effect.clone(), self.instance.clone());
@@ -197,9 +193,9 @@ pub struct Drift {
     pub coefficient: String,
     /// Unit of it; 1 for a level, as a factor.
     pub unit: String,
-    /// Value at the first sample, if it changes at a constant rate.
+    /// Value in the middle of the first ten minutes, if it changes at a constant rate.
     pub at_start: f64,
-    /// The same at the last sample.
+    /// The same of the last ten minutes.
     pub at_end: f64,
     /// Change per day; of a level that of its logarithm.
     pub per_day: f64,
@@ -364,28 +360,45 @@ pub fn remaining(
 ) -> Result<Option<Unexplained>, IdentificationError> {
     let fit = scorer.fit(added)?;
     let measured = scorer.residual_psd(&fit);
-    let mut levels = scorer.levels(&fit, scorer.total, &measured);
+    let mut levels = scorer.levels(&fit, &measured);
     levels.fit();
     let before = if added.is_empty() { measured.clone() } else { scorer.residual_psd(&scorer.fit(&[])?) };
     let plan = scorer.plan();
     // Housekeeping was compared with the residuals of the model: what was added since may have explained it.
     let explained = |w: &Coherence| {
         let Some(c) = scorer.candidate_set.channels.iter().position(|name| *name == w.channel) else { return false };
-        let inside = |b: &usize| (w.band_hz[0]..=w.band_hz[1]).contains(&plan.frequency_hz(plan.bands[*b]));
-        let left: Vec<f64> =
-            (0..plan.bands.len()).filter(inside).map(|b| measured[b][(c, c)] / before[b][(c, c)]).collect();
-        left.iter().sum::<f64>() < (1.0 - 0.5 * w.explained) * left.len() as f64
+        let bands = plan.bands.iter().zip(before.iter().zip(&measured));
+        is_explained(w, bands.map(|(band, (before, after))| (plan.frequency_hz(*band), before[(c, c)], after[(c, c)])))
     };
-    Ok(unexplained(scorer, &levels, &explained))
+    let has_transient = leaves_a_transient(&scorer.gathered.transients, added, scorer.settings);
+    Ok(unexplained(scorer, &levels, &explained, has_transient))
+}
+
+/// Whether half of the coherent power of housekeeping is gone from a channel, by its power in bands before and after
+/// something was added to the model: frequency, before, after. Bands without an observation, as short data have them
+/// at the lowest frequencies, say nothing.
+fn is_explained(w: &Coherence, bands: impl Iterator<Item = (f64, f64, f64)>) -> bool {
+    let inside = bands.filter(|(hz, before, _)| (w.band_hz[0]..=w.band_hz[1]).contains(hz) && *before > 0.0);
+    let left: Vec<f64> = inside.map(|(_, before, after)| after / before).collect();
+    left.iter().sum::<f64>() < (1.0 - 0.5 * w.explained) * left.len() as f64
+}
+
+/// Whether a transient is certain that none of what was added is.
+fn leaves_a_transient(transients: &Transients, added: &[Candidate], settings: &Settings) -> bool {
+    let times: Vec<i64> = added.iter().filter_map(Candidate::at_ns).collect();
+    let is_new = |d: &Detection| times.iter().all(|t| !is_one_transient(*t, d.at_ns, settings.same_transient_s));
+    transients.certain(settings.false_alarm).any(is_new)
 }
 
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and housekeeping that is coherent with
 /// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
-/// the power. What is `explained` since is no coherence any more.
+/// the power. What is `explained` since is no coherence any more. `has_transient` says that one is certain and in no
+/// model.
 fn unexplained(
     scorer: &CandidateScorer<'_>,
     levels: &Levels<'_>,
     explained: &dyn Fn(&Coherence) -> bool,
+    has_transient: bool,
 ) -> Option<Unexplained> {
     let settings = scorer.settings;
     let plan = scorer.plan();
@@ -399,11 +412,8 @@ fn unexplained(
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     let all = scorer.gathered.housekeeping.coherences(channels);
-    let significant: Vec<Coherence> = all
-        .into_iter()
-        .filter(|w| !explained(w))
-        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < settings.coherence_false_alarm)
-        .collect();
+    let significant: Vec<Coherence> =
+        all.into_iter().filter(|w| !explained(w)).filter(|w| w.p_value() < settings.coherence_false_alarm).collect();
     let power = !loud.is_empty();
     if !power {
         // A driver that explains a part x of the power raises it by 1/(1 − x).
@@ -415,7 +425,7 @@ fn unexplained(
     let mut names: Vec<String> = loud.iter().map(|(c, _, _)| channels[*c].clone()).collect();
     names.sort();
     names.dedup();
-    let kind = if scorer.gathered.transients.detections.iter().any(|h| h.significance > 10.0) {
+    let kind = if has_transient {
         "transient"
     } else if band_hz[1] < settings.drift_hz {
         "drift"
@@ -444,7 +454,8 @@ fn unexplained(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_schema::Settings;
+    use crate::candidates::Form;
+    use serde_json::json;
 
     /// Two values differ by a normal variable of their common σ: χ² is its square, p that of two sides.
     #[test]
@@ -472,5 +483,53 @@ mod tests {
             assert!((alone / (0.5 * Settings::default().false_alarm) - 1.0).abs() < 0.02, "{effect}: {alone}");
         }
         assert!(trials.p_value("one", 20.0, 1.0).1 < trials.p_value("many", 25.0, 1.0).1);
+    }
+
+    /// A coherence of which nearly all is gone is explained, also where every second band has no observation; one of
+    /// which nothing is gone is not, nor one in whose band there is no observation.
+    #[test]
+    fn bands_without_observations_do_not_hide_what_explains_a_coherence() {
+        let coherence = Coherence {
+            driver: "hk/t".to_owned(),
+            of: vec!["hk/t".to_owned()],
+            channel: "a".to_owned(),
+            statistic: 50.0,
+            dof: 10.0,
+            trials: 1.0,
+            explained: 0.6,
+            band_hz: [1e-4, 1e-3],
+        };
+        let bands =
+            |after: f64| (1..10).map(move |k| (1e-4 * f64::from(k), f64::from(k % 2), f64::from(k % 2) * after));
+        assert!(is_explained(&coherence, bands(0.4)) && !is_explained(&coherence, bands(1.0)));
+        assert!(!is_explained(&coherence, [(5e-4, 0.0, 0.0)].into_iter()));
+    }
+
+    /// A certain transient is left unless it is one of what was added; one that may be chance is none.
+    #[test]
+    fn a_transient_that_is_named_is_not_left() {
+        let detection = |significance| Detection {
+            effect: "impulse".to_owned(),
+            instance: "sc.x".to_owned(),
+            coefficient: "impulse.sc.x".to_owned(),
+            unit: "N s".to_owned(),
+            shape: Map::new(),
+            at_ns: 5_000_000_000_000,
+            significance,
+        };
+        let added = |at_ns: i64| {
+            let shape = Map::from_iter([("at_ns".to_owned(), json!(at_ns))]);
+            let (unit, terms) = ("N s".to_owned(), Vec::new());
+            let form = Form { shape, unit, lower: None, upper: None, terms, colours: None };
+            let (effect, instance) = ("impulse".to_owned(), "tm1.x".to_owned());
+            [Candidate { effect, instance, transient: true, parts: vec![(0, form)] }]
+        };
+        let (settings, hour_ns) = (Settings::default(), 3_600_000_000_000);
+        let left = |significance, added: &[Candidate]| {
+            let all = Transients { detections: vec![detection(significance)], tried: 1e4 };
+            leaves_a_transient(&all, added, &settings)
+        };
+        assert!(left(20.0, &[]) && !left(4.0, &[]));
+        assert!(!left(20.0, &added(5_000_000_000_000)) && left(20.0, &added(5_000_000_000_000 + 2 * hour_ns)));
     }
 }

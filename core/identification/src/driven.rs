@@ -84,6 +84,11 @@ impl Driven {
     }
 }
 
+/// Whether a function is a product, of two housekeeping channels or of one with a known series.
+fn is_product(driver: Driver) -> bool {
+    matches!(driver, Driver::Product(..) | Driver::Modulated(..))
+}
+
 impl SlowSamples {
     /// Functions that are tried at some places by [`Self::driven`].
     pub fn functions(&self, places: &[usize], housekeeping: &HousekeepingCoherence) -> usize {
@@ -95,26 +100,22 @@ impl SlowSamples {
     }
 
     fn forms(&self, housekeeping: &HousekeepingCoherence) -> Vec<(Driver, Memory)> {
-        let memories = self.memories();
         let with = |driver: &Driver| {
-            let all = match driver {
-                Driver::Product(..) | Driver::Modulated(..) => &[Memory::None],
-                // The integral of a derivative is the value.
-                Driver::Derivative(_) => &memories[1..],
-                _ => &memories[..],
-            };
-            all.iter().map(|memory| (*driver, *memory)).collect::<Vec<_>>()
+            let all = if is_product(*driver) { vec![Memory::None] } else { self.memories(*driver) };
+            all.into_iter().map(|memory| (*driver, memory)).collect::<Vec<_>>()
         };
         housekeeping.drivers.iter().flat_map(with).collect()
     }
 
-    /// Lags from a part of the distance of samples, by which slow samples move, to the length of the longest stretch;
-    /// the integral first.
-    fn memories(&self) -> Vec<Memory> {
+    /// Memories that a function may have: the integral, none, and lags from a part of the distance of samples, by which
+    /// slow samples move, to the length of the longest stretch.
+    fn memories(&self, driver: Driver) -> Vec<Memory> {
         let longest = self.products.iter().flatten().map(Stretch::len).max().unwrap_or(0) as f64;
         let count = longest.max(1.0).log2() as i32;
         let lags = (-2..count).map(|k| Memory::Lag(self.step_s * RATIO.powi(k)));
-        [Memory::Integral, Memory::None].into_iter().chain(lags).collect()
+        // The integral of a derivative is the value.
+        let integral = (!matches!(driver, Driver::Derivative(_))).then_some(Memory::Integral);
+        integral.into_iter().chain([Memory::None]).chain(lags).collect()
     }
 
     /// Functions of housekeeping for the one of some places at which they explain most, and the first of them for the
@@ -407,10 +408,14 @@ impl<'a> Search<'a> {
         forms.iter().enumerate().map(gain).collect()
     }
 
-    /// The best memory of a function, between the lags that are tried too.
+    /// The best memory of a function, between the lags that are tried too. A product counts as one trial, without a
+    /// memory: it has one only if it explains more with it than the best of so many would by chance.
     fn refined(&self, (driver, best): (Driver, Memory)) -> (Driver, Memory) {
         let gain = |memory: Memory| self.gains(&[(driver, memory)])[0].declared;
-        let all = self.samples.memories().into_iter().map(|memory| (memory, gain(memory)));
+        let memories = self.samples.memories(driver);
+        let uncounted = if is_product(driver) { 2.0 * (memories.len() as f64).ln() } else { 0.0 };
+        let counted = |memory: Memory| if memory == Memory::None { 0.0 } else { uncounted };
+        let all = memories.into_iter().map(|memory| (memory, gain(memory) - counted(memory)));
         let memory = all.max_by(|a, b| a.1.total_cmp(&b.1)).map_or(best, |(memory, _)| memory);
         let Memory::Lag(lag_s) = memory else { return (driver, memory) };
         let (mut low, mut high) = ((lag_s / RATIO).ln(), (lag_s * RATIO).ln());

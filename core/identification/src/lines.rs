@@ -21,7 +21,7 @@ const LONGEST: usize = 1 << 20;
 const SHORTEST: usize = 2048;
 /// Periods that a stretch must hold.
 const PERIODS: usize = 20;
-/// Bins around which give the local mean.
+/// Values, two in a bin, on either side that give the local mean.
 const AROUND: usize = 256;
 /// Ratio of frequencies within which the declared noise is taken as constant.
 const RATIO: f64 = 1.02;

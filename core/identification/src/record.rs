@@ -43,7 +43,9 @@ impl Record {
         let common = self.candidate_set.common(&other.candidate_set);
         let (a, b) = (&self.gathered, &other.gathered);
         let same = [
-            (common.is_some(), "models, candidates or housekeeping"),
+            (common.is_some(), "models or candidates"),
+            (a.housekeeping.is_like(&b.housekeeping), "housekeeping"),
+            (a.slow.housekeeping().eq(b.slow.housekeeping()), "housekeeping"),
             (self.noise == other.noise, "declared noise"),
             (a.columns == b.columns, "columns"),
             (a.length == b.length && a.rate_hz == b.rate_hz, "segments"),

@@ -64,8 +64,6 @@ pub struct WithoutExcess {
     pub plain: Fit,
     /// Bands of the excess.
     pub bands: Vec<bool>,
-    /// Real observations in them.
-    pub observations: f64,
 }
 
 /// A candidate beside a fit.
@@ -186,7 +184,7 @@ impl<'a> CandidateScorer<'a> {
     }
 
     fn scored(&self, added: Vec<Candidate>, solved: Solved) -> Fit {
-        let mut scores = self.scores(self.total, &solved);
+        let mut scores = self.scores(&solved);
         let Solved { layout, columns, estimate } = solved;
         scores.covariance = estimate.known.clone().try_inverse().unwrap_or(scores.covariance);
         scores.bound_score = estimate.bound_score.clone();
@@ -195,7 +193,8 @@ impl<'a> CandidateScorer<'a> {
 
     /// Inner products of the data with the residuals of the solution, every band weighted by its own time.
     /// Neither surveys nor ranges enter `covariance` and `bound_score` here.
-    fn scores(&self, gram: &Gram, solved: &Solved) -> Scores {
+    fn scores(&self, solved: &Solved) -> Scores {
+        let gram = self.total;
         let Solved { layout, columns, estimate } = solved;
         let n = self.gathered.columns.names.len();
         let channels = self.candidate_set.channels.len();
@@ -234,32 +233,32 @@ impl<'a> CandidateScorer<'a> {
         Scores { residual, model, normal, covariance, bound_score: score, weights, theta }
     }
 
-    /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
-    pub fn levels<'b>(&'b self, fit: &Fit, gram: &Gram, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
+    /// Levels of the mission's noise beside the residual spectra `measured`.
+    pub fn levels<'b>(&'b self, fit: &Fit, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
         let unknowns = self.candidate_set.unknowns(&fit.added);
         let colours = colours(&unknowns, &fit.estimate.theta);
-        Levels::new(self.noise, &self.plan, &gram.weights, measured, self.settings).coloured(&self.plan, &colours)
+        Levels::new(self.noise, &self.plan, &self.total.weights, measured, self.settings).coloured(&self.plan, &colours)
     }
 
     /// The fit under a Σ that has not absorbed the excess of power; none where there is no excess. Under it the cause
     /// of the excess scores high, and so does whatever correlates with the excess by chance.
     pub fn without_excess(&self, fit: &Fit) -> Option<WithoutExcess> {
         let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, self.total, &measured);
+        let mut levels = self.levels(fit, &measured);
         levels.fit();
         let (bands, observations) = levels.excess_bands();
         if observations <= 0.0 {
             return None;
         }
         let plain = self.under(fit, levels.plain_inverses());
-        Some(WithoutExcess { plain, bands, observations })
+        Some(WithoutExcess { plain, bands })
     }
 
     /// The same solution with other Σ⁻¹ in the scores.
     fn under(&self, fit: &Fit, inverses: Vec<DMatrix<f64>>) -> Fit {
         let estimate = Estimate { inverses, ..fit.estimate.clone() };
         let mut solved = Solved { layout: fit.layout.clone(), columns: fit.columns.clone(), estimate };
-        solved.estimate.known += self.scores(self.total, &solved).normal - &fit.scores.normal;
+        solved.estimate.known += self.scores(&solved).normal - &fit.scores.normal;
         self.scored(fit.added.clone(), solved)
     }
 
@@ -272,12 +271,12 @@ impl<'a> CandidateScorer<'a> {
     /// As [`Self::fit`].
     pub fn deviance(&self, fit: &Fit, bands: &[bool], added: &[Candidate]) -> Result<f64, EstimateError> {
         let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, self.total, &measured);
+        let mut levels = self.levels(fit, &measured);
         levels.fit();
         let mut least = f64::INFINITY;
         for refinements in [0, REFINEMENTS] {
             let Solved { layout, columns, estimate } = self.solve(added, refinements)?;
-            least = least.min(levels.deviance(&Self::residual(self.total, &layout, &columns, &estimate.theta), bands));
+            least = least.min(levels.deviance(&self.residual(&layout, &columns, &estimate.theta), bands));
         }
         Ok(least)
     }
@@ -289,7 +288,7 @@ impl<'a> CandidateScorer<'a> {
     /// As [`Self::fit`].
     pub fn profile_deviance(&self, added: &[Candidate], bands: &[bool]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
-        let measured = Self::residual(self.total, &layout, &columns, &estimate.theta);
+        let measured = self.residual(&layout, &columns, &estimate.theta);
         let unknowns = self.candidate_set.unknowns(added);
         let colours = colours(&unknowns, &estimate.theta);
         let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured, self.settings);
@@ -363,17 +362,11 @@ impl<'a> CandidateScorer<'a> {
         candidate.parts.iter().map(|(_, form)| of(form)).collect()
     }
 
-    fn weighed(
-        gram: &Gram,
-        weights: &[DMatrix<f64>],
-        theta: &DVector<f64>,
-        a: &Candidate,
-        b: &Candidate,
-    ) -> DMatrix<f64> {
+    fn weighed(&self, weights: &[DMatrix<f64>], theta: &DVector<f64>, a: &Candidate, b: &Candidate) -> DMatrix<f64> {
         let (a, b) = (Self::terms(a, theta), Self::terms(b, theta));
         DMatrix::from_fn(a.len(), b.len(), |i, j| {
             let mut sum = 0.0;
-            for (g, w) in gram.bands.iter().zip(weights) {
+            for (g, w) in self.total.bands.iter().zip(weights) {
                 let m = g.order();
                 for (s, c, f) in a[i].iter().filter(|t| t.0 < m) {
                     for (t, d, h) in b[j].iter().filter(|t| t.0 < m) {
@@ -394,19 +387,19 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Score and information of a candidate beside the model; none where it is unobservable or contained in the model.
-    fn beside(gram: &Gram, scores: &Scores, candidate: &Candidate) -> Option<Beside> {
-        let own = Self::weighed(gram, &scores.weights, &scores.theta, candidate, candidate);
+    fn beside(&self, scores: &Scores, candidate: &Candidate) -> Option<Beside> {
+        let own = self.weighed(&scores.weights, &scores.theta, candidate, candidate);
         let (score, with_model) = Self::against(scores, candidate);
         // The missing candidate may have pushed a coefficient to the end of its range, where the score of the data is
         // not zero. Beside the candidate that coefficient moves back, so its score enters the candidate's.
         let score = score - &with_model * (&scores.covariance * &scores.bound_score);
         let information = &own - &with_model * &scores.covariance * with_model.transpose();
-        let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
-        (left > 1e-9).then_some(Beside { score, information })
+        let left = |i: usize| own[(i, i)] > 0.0 && information[(i, i)] > 1e-9 * own[(i, i)];
+        (0..own.nrows()).all(left).then_some(Beside { score, information })
     }
 
     fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
-        let Beside { score, information } = Self::beside(self.total, scores, &candidate)?;
+        let Beside { score, information } = self.beside(scores, &candidate)?;
         let bounds: Vec<(f64, f64)> = candidate
             .parts
             .iter()
@@ -425,7 +418,7 @@ impl<'a> CandidateScorer<'a> {
         let of = |bands: &dyn Fn(usize) -> bool| {
             let weights: Vec<DMatrix<f64>> =
                 fit.scores.weights.iter().enumerate().map(|(b, w)| w * f64::from(u8::from(bands(b)))).collect();
-            Self::weighed(self.total, &weights, theta, candidate, candidate).diagonal()
+            self.weighed(&weights, theta, candidate, candidate).diagonal()
         };
         // Of several coefficients, each in its own unit.
         of(&|b| bands[b]).component_div(&of(&|_| true)).mean()
@@ -446,7 +439,7 @@ impl<'a> CandidateScorer<'a> {
         let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
         let factors: Vec<f64> = energy.unwrap_or_else(lasts);
         let size = |w: &[DMatrix<f64>]| {
-            let own = Self::weighed(self.total, w, &fit.scores.theta, candidate, candidate);
+            let own = self.weighed(w, &fit.scores.theta, candidate, candidate);
             scored.value.dot(&(own * &scored.value))
         };
         let better: Vec<DMatrix<f64>> = fit.scores.weights.iter().zip(&factors).map(|(w, r)| w * *r).collect();
@@ -522,14 +515,14 @@ impl<'a> CandidateScorer<'a> {
 
     /// Cross-spectra of the residuals of a fit per band, over those of white noise of unit PSD: a measured Σ.
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
-        Self::residual(self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
+        self.residual(&fit.layout, &fit.columns, &fit.estimate.theta)
     }
 
-    fn residual(gram: &Gram, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
-        let spectra: Spectra = gram.select(columns);
+    fn residual(&self, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
+        let spectra: Spectra = self.total.select(columns);
         dragfree_estimation::normal::residual_spectra(&spectra, layout, theta)
             .into_iter()
-            .zip(&gram.weights.expected)
+            .zip(&self.total.weights.expected)
             .map(|(r, e)| r / e.max(f64::MIN_POSITIVE))
             .collect()
     }

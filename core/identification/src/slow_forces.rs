@@ -21,7 +21,7 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
     let directions = held_directions(declared, channels);
     let plan = scorer.plan();
     let measured = scorer.residual_psd(fit);
-    let mut levels = scorer.levels(fit, scorer.total, &measured);
+    let mut levels = scorer.levels(fit, &measured);
     levels.fit();
     let observations = scorer.total.weights.observations(plan);
     let bands: Vec<BandSpectra<'_>> = (0..plan.bands.len())

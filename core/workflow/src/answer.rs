@@ -193,7 +193,7 @@ fn by_product(decided: &Decided, set: &[usize], parameter: usize, products: &[Wr
         let (values, sigma) = quadratic.solution(set);
         OfProduct { product: written.product.id().to_owned(), value: values[parameter], sigma: sigma[parameter] }
     };
-    decided.by_product.iter().zip(products).map(of).collect()
+    decided.data_of_products().iter().zip(products).map(of).collect()
 }
 
 /// Limits of a candidate's coefficients; none of a formula, which the data themselves have written.
@@ -369,8 +369,10 @@ pub(crate) fn with_levels(
     settings: &Settings,
 ) -> Vec<OtherLevel> {
     let mut within = Vec::new();
-    for f in louder(levels, decided.chi2, decided.numbers, evidence) {
-        match f.standing(settings) {
+    for (level, f) in levels.iter().zip(louder(levels, decided.chi2, decided.numbers, evidence)) {
+        // Over the level that the model states, which a mission file may have wrong by as much.
+        let is_beyond = level.ln.abs() > settings.level_tolerance.ln_1p();
+        match (f.p_value < settings.false_alarm, is_beyond) {
             (true, true) => named.push(Found { accepted: true, ..f }),
             (true, false) => within.push(f.level()),
             (false, _) => {}
@@ -399,20 +401,20 @@ pub(crate) fn verdict(named: &[Found], left: bool) -> &'static str {
     }
 }
 
-/// Offsets of the model, with σ if nothing undetected acts, and if every lasting effect that is installed may.
-pub(crate) fn offsets(decided: &Decided, evidence: &Evidence<'_>) -> Vec<Offset> {
-    let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+/// Offsets of the model beside the candidates `named`, with σ if nothing undetected acts, and if every lasting effect
+/// that is installed may.
+pub(crate) fn offsets(decided: &Decided, evidence: &Evidence<'_>, named: &[usize]) -> Vec<Offset> {
     let lasts = |c: &usize| {
         let place = &decided.candidates[*c];
         let proposed = evidence.proposal(&place.effect, &place.instance).is_some();
         !named.contains(c) && !proposed && place.family() == place.effect
     };
     let others: Vec<usize> = (0..decided.candidates.len()).filter(lasts).collect();
-    let values = &decided.selection.values;
+    let (values, sigma_of_noise) = decided.quadratic.solution(named);
     // About the value that is given: what the others would move it by in these data counts too.
     let with = |others: &[usize]| {
-        let (moved, sigma) = decided.quadratic.solution_with(&named, others);
-        (moved - values).zip_map(&sigma, f64::hypot)
+        let (moved, sigma) = decided.quadratic.solution_with(named, others);
+        (moved - &values).zip_map(&sigma, f64::hypot)
     };
     let sigma = with(&others);
     let alone: Vec<_> = others.iter().map(|c| (c, with(&[*c]))).collect();
@@ -423,7 +425,7 @@ pub(crate) fn offsets(decided: &Decided, evidence: &Evidence<'_>) -> Vec<Offset>
             most_from: most().map(|(c, _)| decided.candidates[**c].name()),
             coefficient: name.clone(),
             value_m: values[i],
-            sigma_m: decided.selection.sigma[i],
+            sigma_m: sigma_of_noise[i],
             sigma_with_undetected_m: sigma[i],
         })
     };
@@ -470,8 +472,45 @@ pub(crate) fn contradict(diagnosis: &mut Diagnosis, products: &[Written]) {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+    use crate::likelihood::joined;
+
+    /// One form of one effect.
+    pub(crate) fn one_trial() -> Trials {
+        serde_json::from_value(json!({ "forms": { "effect": 1.0 } })).expect("trials")
+    }
+
+    /// A level is told where it is certain, and named where it is farther from what the model states than a mission
+    /// file may be wrong: 1.53 is not beside a stated 1.5, and 1 is beside a stated 1.2.
+    #[test]
+    fn a_level_is_named_by_its_distance_from_what_the_model_states() {
+        let level = |name: &str, stated: f64, value: f64, sigma| NoiseLevel {
+            effect: name.to_owned(),
+            instance: "sc".to_owned(),
+            coefficient: name.to_owned(),
+            stated,
+            ln: (value / stated).ln(),
+            sigma,
+            channels: Vec::new(),
+            rivals: None,
+        };
+        let all = [
+            level("stated", 1.5, 1.53, 0.003),
+            level("wrong", 1.2, 1.0, 0.003),
+            level("louder", 1.0, 1.2, 0.003),
+            level("uncertain", 1.0, 1.3, 0.3),
+        ];
+        let settings = Settings::default();
+        let evidence =
+            Evidence { trials: one_trial(), least: settings.false_alarm, products: &[], proposals: Vec::new() };
+        let decided = joined(Vec::new(), &settings, &evidence, Vec::new());
+        let mut named = Vec::new();
+        let within = with_levels(&mut named, &all, &decided, &evidence, &settings);
+        let mut names: Vec<&str> = named.iter().map(|f| f.effect.as_str()).collect();
+        names.sort_unstable();
+        assert_eq!((names, within.len(), within[0].effect.as_str()), (vec!["louder", "wrong"], 1, "stated"));
+    }
 
     /// What explains a level on several days is what does on each of them; evidence adds.
     #[test]

@@ -196,14 +196,18 @@ impl Detected {
     /// Those of the spectra, as many as the settings allow, and those near the ends.
     fn new(found: &Transients, near_ends: &Transients, settings: &Settings) -> Self {
         let same_s = settings.same_transient_s;
-        let (mut all, mut near) = (Vec::new(), Vec::new());
+        let (mut all, mut near, mut times_near) = (Vec::new(), Vec::new(), Vec::new());
         let mut loudest: Vec<Detection> = Vec::new();
         for detection in found.certain(settings.transient_p_value) {
             let at_an_end = near_ends.detections.contains(detection);
             if loudest.iter().all(|other| !is_one(detection, other, same_s)) {
                 loudest.push(detection.clone());
-                if at_an_end && near.len() < settings.max_transients {
+                // Of a transient near an end there is one detection for each place.
+                let is_one = |at_ns: &i64| is_one_transient(*at_ns, detection.at_ns, same_s);
+                let is_known = times_near.iter().any(is_one);
+                if at_an_end && (is_known || times_near.len() < settings.max_transients) {
                     near.push(detection.clone());
+                    times_near.extend((!is_known).then_some(detection.at_ns));
                 }
             }
             if !at_an_end && all.len() < settings.max_transients {
@@ -490,6 +494,7 @@ fn answer(
     let beside_constants = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
     let unobservable = screened.unobservable.iter().cloned().chain(beside_constants);
     let unobservable = unobservable.map(|name| (name, UNOBSERVABLE.to_owned()));
+    let offsets = offsets(decided, evidence, &answers.kept(decided, &formulas));
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: settings.false_alarm,
@@ -499,7 +504,7 @@ fn answer(
         unexplained,
         formulas,
         drifts,
-        offsets: offsets(decided, evidence),
+        offsets,
         agreement,
         reasons,
         levels,
@@ -590,6 +595,21 @@ mod tests {
             at_ns: 1_000_000_000 * at_s,
             significance: 10.0,
         }
+    }
+
+    /// One transient near an end, as nine places could have made it, leaves a weaker one at the other end a candidate.
+    #[test]
+    fn the_places_of_a_transient_near_an_end_are_one_transient() {
+        let at = |place: usize, at_s, significance| Detection {
+            instance: format!("place{place}"),
+            significance,
+            ..detection(at_s)
+        };
+        let mut all: Vec<Detection> = (0..9).map(|k| at(k, 100, 100.0 - k as f64)).collect();
+        all.push(at(0, 20_000, 20.0));
+        let found = Transients { detections: all, tried: 1.0 };
+        let detected = Detected::new(&found, &found, &Settings::default());
+        assert_eq!(detected.near_ends.len(), 10);
     }
 
     /// Of two detections near an end within what one transient rings, the louder one is a candidate; of two ends, and

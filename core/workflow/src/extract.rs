@@ -379,7 +379,11 @@ pub(crate) fn shared(
             not_tried.insert(format!("{}:{}", c.effect, c.instance), why.to_owned());
         }
     }
-    (extracts.iter().map(|e| e.sums(|c| has(e, c) && (e.names(c) || several(c)))).collect(), not_tried)
+    let sums: Vec<_> = extracts.iter().map(|e| e.sums(|c| has(e, c) && (e.names(c) || several(c)))).collect();
+    // What one day could not try, others may have.
+    let tried = sums.iter().flat_map(|s| &s.coefficients).filter(|c| c.candidate);
+    tried.for_each(|c| drop(not_tried.remove(&format!("{}:{}", c.effect, c.instance))));
+    (sums, not_tried)
 }
 
 fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
@@ -421,6 +425,7 @@ fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence
     reasons.extend(apart(agreement.as_ref(), settings));
     reasons.extend(extracts.iter().filter_map(left));
     let verdict = verdict(&answers.named, !reasons.is_empty());
+    let offsets = offsets(decided, evidence, &answers.kept(decided, &[]));
     Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: settings.false_alarm,
@@ -430,7 +435,7 @@ fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence
         unexplained: None,
         formulas: Vec::new(),
         drifts: Vec::new(),
-        offsets: offsets(decided, evidence),
+        offsets,
         agreement,
         reasons,
         levels,

@@ -67,7 +67,7 @@ impl Answers {
         decided: &Decided,
         evidence: &Evidence<'_>,
     ) -> Vec<Found> {
-        let mut formulas = Vec::new();
+        let mut formulas: Vec<Found> = Vec::new();
         for (place, rivals) in not_told_from_formulas(settings, decided, evidence) {
             let words = |f: &Found| evidence.proposal(&f.effect, &f.instance).map(|p| p.words.clone());
             let names: Vec<String> = rivals.iter().filter_map(words).collect();
@@ -75,7 +75,15 @@ impl Answers {
                 let all: Vec<String> = names.iter().chain(&f.confounders).cloned().collect();
                 format!("these data do not tell it from {}", first_few(&all))
             });
-            formulas.extend(rivals);
+            // One formula may take the place of several effects.
+            for rival in rivals {
+                let is_it = |f: &&mut Found| (&f.effect, &f.instance) == (&rival.effect, &rival.instance);
+                match formulas.iter_mut().find(is_it) {
+                    Some(other) if other.log10_p_value > rival.log10_p_value => *other = rival,
+                    Some(_) => {}
+                    None => formulas.push(rival),
+                }
+            }
         }
         formulas
     }
@@ -112,6 +120,16 @@ impl Answers {
         let is_one = |f: &Found| doubtful.iter().any(|c| (&c.effect, &c.instance) == (&f.effect, &f.instance));
         self.refuse(is_one, |_| format!("with it {} still show what no effect explains", u.channels.join(", ")));
         Ok(())
+    }
+
+    /// The chosen candidates that are named or are among the proposed `formulas`.
+    pub(crate) fn kept(&self, decided: &Decided, formulas: &[Found]) -> Vec<usize> {
+        let is_kept = |c: &usize| {
+            let place = &decided.candidates[*c];
+            let mut all = self.named.iter().chain(formulas);
+            all.any(|f| (&f.effect, &f.instance) == (&place.effect, &place.instance))
+        };
+        decided.selection.chosen.iter().map(|f| f.candidate).filter(is_kept).collect()
     }
 
     /// The others by significance.
@@ -226,43 +244,57 @@ fn first_few(names: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::answer::offsets;
+    use crate::answer::tests::one_trial;
     use crate::likelihood::{CoefficientSums, joined};
-    use dragfree_identification::diagnosis::Trials;
+    use dragfree_identification::diagnosis::Offset;
     use dragfree_schema::Coefficient;
     use nalgebra::{DMatrix, DVector};
     use std::collections::BTreeMap;
 
-    /// Four days of two effects whose series have a correlation of 0.7, of which the first acts with `value` and cannot
-    /// be larger than 0.3; each day knows a value by 0.02.
-    fn answers(value: f64) -> (Answers, Vec<Found>) {
-        let coefficient = |effect: &str, upper: f64| Coefficient {
-            name: format!("{effect}.sc"),
-            effect: effect.to_owned(),
-            instance: "sc".to_owned(),
-            unit: "rad".to_owned(),
-            candidate: true,
-            upper,
-            ..Coefficient::default()
-        };
-        let information: DMatrix<f64> = 2500.0 * DMatrix::from_row_slice(2, 2, &[1.0, 0.7, 0.7, 1.0]);
-        let score = &information * DVector::from_column_slice(&[value, 0.0]);
-        let day = || CoefficientSums {
-            coefficients: vec![coefficient("large", 0.3), coefficient("like-it", f64::INFINITY)],
-            information: information.clone(),
-            score: score.clone(),
-            chi2: 1e4,
-            numbers: 1e4,
-            surveys: Vec::new(),
-            channels: BTreeMap::new(),
-        };
-        let settings = Settings::default();
-        let evidence =
-            Evidence { trials: Trials::default(), least: settings.false_alarm, products: &[], proposals: Vec::new() };
-        let decided = joined((0..4).map(|_| day()).collect(), &settings, &evidence, Vec::new());
-        let mut answers = Answers::new(&settings, &decided, &evidence);
-        let before = answers.named.clone();
-        answers.refuse_stand_ins(&decided, &evidence, &settings);
-        (answers, before)
+    /// Four days of an offset and two effects whose series have correlations of 0.7, 0.5 and 0.5, of which the first
+    /// effect acts with `value` and cannot be larger than 0.3; each day knows a value by 0.02.
+    struct Days {
+        decided: Decided,
+        answers: Answers,
+        before: Vec<Found>,
+        offsets: Vec<Offset>,
+    }
+
+    impl Days {
+        fn new(value: f64) -> Self {
+            let candidate = |effect: &str, upper: f64| Coefficient {
+                name: format!("{effect}.sc"),
+                effect: effect.to_owned(),
+                instance: "sc".to_owned(),
+                unit: "rad".to_owned(),
+                candidate: true,
+                upper,
+                ..Coefficient::default()
+            };
+            let offset = Coefficient { name: "offset".to_owned(), unit: "m".to_owned(), ..Coefficient::default() };
+            let correlations = [1.0, 0.5, 0.5, 0.5, 1.0, 0.7, 0.5, 0.7, 1.0];
+            let information: DMatrix<f64> = 2500.0 * DMatrix::from_row_slice(3, 3, &correlations);
+            let score = &information * DVector::from_column_slice(&[0.0, value, 0.0]);
+            let day = || CoefficientSums {
+                coefficients: vec![offset.clone(), candidate("large", 0.3), candidate("like-it", f64::INFINITY)],
+                information: information.clone(),
+                score: score.clone(),
+                chi2: 1e4,
+                numbers: 1e4,
+                surveys: Vec::new(),
+                channels: BTreeMap::new(),
+            };
+            let settings = Settings::default();
+            let evidence =
+                Evidence { trials: one_trial(), least: settings.false_alarm, products: &[], proposals: Vec::new() };
+            let decided = joined((0..4).map(|_| day()).collect(), &settings, &evidence, Vec::new());
+            let mut answers = Answers::new(&settings, &decided, &evidence);
+            let before = answers.named.clone();
+            answers.refuse_stand_ins(&decided, &evidence, &settings);
+            let offsets = offsets(&decided, &evidence, &answers.kept(&decided, &[]));
+            Self { decided, answers, before, offsets }
+        }
     }
 
     fn effects(all: &[Found]) -> Vec<&str> {
@@ -273,17 +305,17 @@ mod tests {
     /// want; the reasons say both, where nothing else is named. Inside of the range it is named.
     #[test]
     fn nothing_stands_in_on_several_days_for_what_is_outside_of_its_range() {
-        let (outside, before) = answers(0.5);
+        let Days { answers: outside, before, .. } = Days::new(0.5);
         assert_eq!((effects(&before), effects(&outside.named)), (vec!["like-it"], vec![]));
         let reasons = outside.why_none_is_named();
         let says = |words: &str| reasons.iter().any(|reason| reason.contains(words));
         assert!(reasons.len() == 2 && says("like-it:sc would lower χ²"), "{reasons:?}");
         assert!(
-            says("large:sc explains more in its place, with 5.00e-1 ± 1.0e-2 rad, outside its physical range"),
+            says("large:sc explains more in its place, with 5.00e-1 ± 1.2e-2 rad, outside its physical range"),
             "{reasons:?}"
         );
         assert!(says("large:sc would lower χ²") && says("its best value lies outside its physical range"));
-        let (inside, before) = answers(0.2);
+        let Days { answers: inside, before, .. } = Days::new(0.2);
         assert_eq!((effects(&before), effects(&inside.named)), (vec!["large"], vec!["large"]));
         assert!(inside.why_none_is_named().is_empty());
     }
@@ -291,13 +323,29 @@ mod tests {
     /// A reason that is given for a refused one is no reason for anything where another is named.
     #[test]
     fn a_refused_one_beside_a_named_one_is_no_reason() {
-        let (mut all, _) = answers(0.2);
-        all.named.extend(answers(0.2).0.named.into_iter().map(|f| Found { effect: "other".to_owned(), ..f }));
+        let mut all = Days::new(0.2).answers;
+        all.named.extend(Days::new(0.2).answers.named.into_iter().map(|f| Found { effect: "other".to_owned(), ..f }));
         all.refuse(|f| f.effect == "large", |f| format!("{} is a test's", f.instance));
         let refused: Vec<_> =
             all.others.iter().filter_map(|f| f.refused.as_deref().map(|why| (f.accepted, why))).collect();
         assert_eq!((effects(&all.named), refused), (vec!["other"], vec![(false, "sc is a test's")]));
         assert!(all.why_none_is_named().is_empty());
         assert_eq!(effects(&all.into_candidates(1)), ["other", "like-it"]);
+    }
+
+    /// Offsets are those beside what is named, with its own σ: without what is refused, whose part then counts as that
+    /// of an effect that is not detected.
+    #[test]
+    fn offsets_stand_beside_what_is_named_and_not_beside_what_is_refused() {
+        for (value, set) in [(0.5, &[][..]), (0.2, &[0][..])] {
+            let Days { decided, offsets, .. } = Days::new(value);
+            let (values, sigma) = decided.quadratic.solution(set);
+            let [offset] = &offsets[..] else { panic!("one offset") };
+            assert_eq!((offset.value_m, offset.sigma_m), (values[0], sigma[0]));
+            assert!(offset.sigma_with_undetected_m > offset.sigma_m);
+        }
+        // Where it is refused the offset has half of it, which the total σ covers.
+        let Offset { value_m, sigma_with_undetected_m, .. } = Days::new(0.5).offsets[0].clone();
+        assert!((value_m - 0.25).abs() < 1e-9 && sigma_with_undetected_m > 0.2, "{value_m} {sigma_with_undetected_m}");
     }
 }

@@ -148,6 +148,7 @@ pub(crate) fn sum(
             detected: forms.map(|forms| forms.detected),
             reference: equations.is_file().then_some(equations.as_path()),
             probes,
+            levels: whole.as_ref().map_or(&[][..], |whole| whole.gathered.housekeeping.levels()),
             threads,
         };
         let examination = Examination {

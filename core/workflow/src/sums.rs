@@ -55,6 +55,8 @@ pub(crate) struct Request<'a> {
     /// channels that a function of housekeeping may drive. Where there are any, products of housekeeping with commands
     /// and displacements are drivers too.
     pub(crate) probes: &'a [EffectEntry],
+    /// Values about which products of housekeeping are taken: those of the product that came first; none of that one.
+    pub(crate) levels: &'a [f64],
     /// Threads; results do not depend on them.
     pub(crate) threads: usize,
 }
@@ -192,7 +194,7 @@ impl ColumnSums {
         let line_search = LineSearch::new(places, residual.clone(), Arc::new(inverse.clone()), step_ns);
         let coherence = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
-            HousekeepingCoherence::new(topics, known, plan, residual, whitening, forces)
+            HousekeepingCoherence::new(topics, known, plan, residual, whitening, forces).about(request.levels)
         };
         let width = wanted.len() + waveforms.len();
         let averaged: Vec<bool> =
@@ -222,6 +224,7 @@ impl ColumnSums {
         // A gap of the telemetry as a whole is none of a candidate's own.
         let measured: Vec<bool> =
             (0..time_ns.len()).map(|k| columns[..self.base].iter().all(|c| c[k].is_finite())).collect();
+        let patience = ((self.settings.patience_s * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
         for (j, column) in columns.iter().enumerate().skip(self.base) {
             if all_finite(column) {
                 self.held[j] = column.last().copied().unwrap_or(self.held[j]);
@@ -234,24 +237,23 @@ impl ColumnSums {
                 column
                     .iter()
                     .zip(&measured)
-                    .map(|(x, measured)| {
+                    .enumerate()
+                    .map(|(k, (x, measured))| {
                         if x.is_finite() {
                             held = *x;
                         } else {
-                            missing += u64::from(*measured);
+                            let waits = held.is_nan() && k < patience;
+                            missing += u64::from(*measured && !waits);
                         }
                         held
                     })
                     .collect(),
             );
             self.held[j] = held;
-            if !self.waiting {
-                self.missing[j] += missing;
-            }
+            self.missing[j] += missing;
         }
         let mut first = columns.first().map_or_else(Vec::new, |c| c.to_vec());
         if self.waiting {
-            let patience = ((self.settings.patience_s * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
             let lacks = |k: usize| filled.iter().any(|c| c[k].is_nan());
             let wait = (0..time_ns.len()).take_while(|k| *k < patience && lacks(*k)).count();
             first[..wait].fill(f64::NAN);

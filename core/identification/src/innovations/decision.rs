@@ -582,5 +582,6 @@ pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64
         (apart, values) = (apart + gain, values + n);
     }
     let (together, n) = highest(&all.0, &all.1);
-    ((apart - together).max(0.0), values - n)
+    // Where a direction is near rounding in each, all together may know it and none alone.
+    ((apart - together).max(0.0), usize::saturating_sub(values, n))
 }

@@ -5,6 +5,9 @@
 //! response `h`, shifted. With innovations e up to the last one, `n(t) = Σ_s h(s)·e(t + s)` has the variance `D(t) =
 //! Σ_s h²(s)`, both over the samples that there are, and `n/√D` is the significance. Constants and starts have been
 //! fitted before, and their score is zero: they only lower D, so the significance is never too high on their account.
+//!
+//! A transient rings through most of a window. The loudest is therefore taken off before the next is looked for, with
+//! the size that the least squares of its own template gives it.
 
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -20,9 +23,13 @@ const WINDOW_S: f64 = 3000.0;
 /// Part of a window, from the end of the data on, in which a transient may begin. In the rest of it the windows inside
 /// of the data see more of it.
 const ZONE: f64 = 0.75;
-/// Windows that are searched at most; each takes some megabytes.
+/// Windows that are searched at most, as each takes some megabytes: those at the ends of all data and at the first and
+/// the last gaps. Beside the other gaps the search by spectra stands.
 const MOST_WINDOWS: usize = 16;
-/// Other places that may have made the same transient are tried at times that differ by less than this, s.
+/// Transients that are looked for in a window at most.
+const MOST_IN_A_WINDOW: usize = 4;
+/// Other places that may have made the same transient are tried at times that differ by less than this, s. What is
+/// nearer to a louder one may be what its template leaves of it, and is not looked for.
 const SAME_S: f64 = 300.0;
 
 /// Some consecutive innovations.
@@ -138,81 +145,55 @@ impl Ends {
             self.windows.push(Window { first_ns: last_first_ns, rows: last, zone: from..self.length });
         }
         // The ends of all data come first and last; those of gaps are left out where there are too many.
-        if self.windows.len() > MOST_WINDOWS {
+        while self.windows.len() > MOST_WINDOWS {
             self.windows.remove(MOST_WINDOWS / 2);
         }
     }
 
-    /// The loudest transient of each window, as every place that could have made it, and where it was looked for.
+    /// The loudest transients of each window, as every place that could have made them, and where they were looked for.
     pub(super) fn search(&self, threads: usize) -> (Transients, Vec<Range<i64>>) {
-        let n = 2 * self.length;
-        let fft = Transforms::new(n);
-        let spectra = |rows: &[f64]| -> Vec<Vec<Complex64>> {
-            let channel = |c: usize| {
-                let mut samples: Vec<f64> = rows.iter().skip(c).step_by(self.channels).copied().collect();
-                samples.resize(n, 0.0);
-                fft.spectrum(samples)
-            };
-            (0..self.channels).map(channel).collect()
-        };
-        let windows: Vec<_> = self.windows.iter().map(|w| spectra(&w.rows)).collect();
-        let responses: Vec<_> = self.responses.iter().map(|rows| spectra(rows)).collect();
-        // Spectrum of the mean of two samples.
-        let previous = |k: usize| Complex64::from_polar(1.0, -TAU * k as f64 / n as f64);
-        let averaging: Vec<Complex64> = (0..=self.length).map(|k| 0.5 * (1.0 + previous(k))).collect();
-        let all: Vec<usize> = (0..self.templates.len()).collect();
-        let look = |templates: &[usize]| {
-            let (mut peaks, mut tried) = (Vec::new(), 0.0);
-            for template in templates {
-                let response = self.response(*template, &responses, &averaging, &fft);
-                let outputs: Vec<Vec<f64>> =
-                    windows.iter().enumerate().map(|(w, spectra)| self.sizes(w, &response, spectra, &fft)).collect();
-                // Noise may exceed the declared one. A transient in one window leaves the others as they are.
-                let louder = outputs.iter().filter_map(|sizes| level(sizes)).fold(f64::INFINITY, f64::min).max(1.0);
-                for (window, sizes) in outputs.iter().enumerate() {
-                    let zone_s = self.windows[window].zone.len() as f64 * self.step_ns as f64 * 1e-9;
-                    tried += response.trials_hz * zone_s;
-                    // The highest of each part: that of all tells whether the transient is in the zone, the others what
-                    // other places could have made there.
-                    for (part, sizes) in sizes.chunks(self.same_rows()).enumerate() {
-                        let highest = sizes.iter().enumerate().filter(|(_, x)| x.is_finite());
-                        let Some((k, size)) = highest.max_by(|a, b| a.1.total_cmp(b.1)) else { continue };
-                        let (row, significance) = (part * self.same_rows() + k, size / louder);
-                        if significance > LEAST {
-                            peaks.push(Peak { template: *template, window, row, significance });
-                        }
-                    }
-                }
+        let look = Look::new(self);
+        let mut rows: Vec<Vec<f64>> = self.windows.iter().map(|w| w.rows.clone()).collect();
+        // Noise may exceed the declared one. A transient in one window leaves the others as they are.
+        let mut levels = vec![f64::INFINITY; self.templates.len()];
+        let mut taken_off: Vec<Vec<usize>> = vec![Vec::new(); self.windows.len()];
+        let mut open: Vec<usize> = (0..self.windows.len()).collect();
+        let mut found = Transients::default();
+        for round in 0..MOST_IN_A_WINDOW {
+            let looked = look.peaks(&open, &rows, &mut levels, threads);
+            if round == 0 {
+                found.tried = looked.iter().map(|own| own.tried).sum();
             }
-            (peaks, tried)
-        };
-        let parts: Vec<(Vec<Peak>, f64)> = std::thread::scope(|scope| {
-            let each = all.len().div_ceil(threads).max(1);
-            let running: Vec<_> = all.chunks(each).map(|own| scope.spawn(|| look(own))).collect();
-            let join = |thread: std::thread::ScopedJoinHandle<'_, (Vec<Peak>, f64)>| {
-                thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
-            };
-            running.into_iter().map(join).collect()
-        });
-        let mut found = Transients { tried: parts.iter().map(|(_, tried)| tried).sum(), ..Transients::default() };
-        let peaks: Vec<Peak> = parts.into_iter().flat_map(|(peaks, _)| peaks).collect();
-        for (w, window) in self.windows.iter().enumerate() {
-            found.add(&Transients { detections: self.loudest(w, window, &peaks), tried: 0.0 });
+            let peaks: Vec<Peak> = looked.into_iter().flat_map(|own| own.peaks).collect();
+            open.retain(|w| {
+                let known = &mut taken_off[*w];
+                let is_new = |p: &&Peak| known.iter().all(|row| p.row.abs_diff(*row) >= self.same_rows());
+                let own: Vec<&Peak> = peaks.iter().filter(|p| p.window == *w).filter(is_new).collect();
+                let Some(loudest) = own.iter().max_by(|a, b| a.significance.total_cmp(&b.significance)) else {
+                    return false;
+                };
+                let detections = self.places(&self.windows[*w], loudest, &own);
+                found.add(&Transients { detections, tried: 0.0 });
+                look.take_off(loudest, &mut rows[*w]);
+                known.push(loudest.row);
+                true
+            });
+            if open.is_empty() {
+                break;
+            }
         }
         let time = |w: &Window, row: usize| w.first_ns + row as i64 * self.step_ns;
         (found, self.windows.iter().map(|w| time(w, w.zone.start)..time(w, w.zone.end)).collect())
     }
 
-    /// The loudest transient of a window if it begins in the zone, as each place could best have made it.
-    fn loudest(&self, w: usize, window: &Window, peaks: &[Peak]) -> Vec<Detection> {
-        let own = || peaks.iter().filter(|p| p.window == w);
-        let Some(best) = own().max_by(|a, b| a.significance.total_cmp(&b.significance)) else { return Vec::new() };
-        if !window.zone.contains(&best.row) {
+    /// A transient of a window if it begins in the zone, as each place could best have made it.
+    fn places(&self, window: &Window, loudest: &Peak, all: &[&Peak]) -> Vec<Detection> {
+        if !window.zone.contains(&loudest.row) {
             return Vec::new();
         }
-        let near = |p: &&Peak| window.zone.contains(&p.row) && p.row.abs_diff(best.row) < self.same_rows();
+        let near = |p: &&&Peak| window.zone.contains(&p.row) && p.row.abs_diff(loudest.row) < self.same_rows();
         let mut places: Vec<&Peak> = Vec::new();
-        for peak in own().filter(near) {
+        for peak in all.iter().filter(near) {
             let place = |p: &Peak| (&self.templates[p.template].effect, &self.templates[p.template].instance);
             match places.iter_mut().find(|other| place(other) == place(peak)) {
                 Some(other) if other.significance < peak.significance => *other = peak,
@@ -227,23 +208,106 @@ impl Ends {
         places.into_iter().map(detection).collect()
     }
 
+    /// Rows in [`SAME_S`].
+    fn same_rows(&self) -> usize {
+        (SAME_S * 1e9 / self.step_ns as f64) as usize
+    }
+}
+
+/// What one template shows in some windows.
+struct Looked {
+    peaks: Vec<Peak>,
+    /// Independent trials.
+    tried: f64,
+}
+
+/// The search for templates in windows.
+struct Look<'a> {
+    ends: &'a Ends,
+    fft: Transforms,
+    /// Spectra of the responses to each channel, by channel of the innovations.
+    responses: Vec<Vec<Vec<Complex64>>>,
+    /// Spectrum of the mean of two samples.
+    averaging: Vec<Complex64>,
+}
+
+impl<'a> Look<'a> {
+    fn new(ends: &'a Ends) -> Self {
+        let n = 2 * ends.length;
+        let fft = Transforms::new(n);
+        let previous = |k: usize| Complex64::from_polar(1.0, -TAU * k as f64 / n as f64);
+        let averaging = (0..=ends.length).map(|k| 0.5 * (1.0 + previous(k))).collect();
+        let mut look = Self { ends, fft, responses: Vec::new(), averaging };
+        look.responses = ends.responses.iter().map(|rows| look.spectra(rows)).collect();
+        look
+    }
+
+    /// Spectra of rows, by channel.
+    fn spectra(&self, rows: &[f64]) -> Vec<Vec<Complex64>> {
+        let channels = self.ends.channels;
+        let channel = |c: usize| {
+            let mut samples: Vec<f64> = rows.iter().skip(c).step_by(channels).copied().collect();
+            samples.resize(2 * self.ends.length, 0.0);
+            self.fft.spectrum(samples)
+        };
+        (0..channels).map(channel).collect()
+    }
+
+    /// Peaks of every template in some windows, template after template. `levels` are the lowest levels of the noise
+    /// that each template has seen.
+    fn peaks(&self, open: &[usize], rows: &[Vec<f64>], levels: &mut [f64], threads: usize) -> Vec<Looked> {
+        let windows: Vec<(usize, Vec<Vec<Complex64>>)> = open.iter().map(|w| (*w, self.spectra(&rows[*w]))).collect();
+        let of = |(template, lowest): (usize, &mut f64)| self.of_template(template, lowest, &windows);
+        let each = levels.len().div_ceil(threads).max(1);
+        let (of, chunks) = (&of, levels.chunks_mut(each).enumerate());
+        std::thread::scope(|scope| {
+            let own = |(k, levels): (usize, &mut [f64])| {
+                levels.iter_mut().enumerate().map(|(i, lowest)| of((k * each + i, lowest))).collect::<Vec<Looked>>()
+            };
+            let running: Vec<_> = chunks.map(|chunk| scope.spawn(move || own(chunk))).collect();
+            let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<Looked>>| {
+                thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+            };
+            running.into_iter().flat_map(join).collect()
+        })
+    }
+
+    fn of_template(&self, template: usize, lowest: &mut f64, windows: &[(usize, Vec<Vec<Complex64>>)]) -> Looked {
+        let response = self.response(template);
+        let outputs: Vec<Vec<f64>> = windows.iter().map(|(w, spectra)| self.sizes(*w, &response, spectra)).collect();
+        *lowest = outputs.iter().filter_map(|sizes| level(sizes)).fold(*lowest, f64::min);
+        let louder = lowest.max(1.0);
+        let mut looked = Looked { peaks: Vec::new(), tried: 0.0 };
+        let same_rows = self.ends.same_rows();
+        for ((window, _), sizes) in windows.iter().zip(&outputs) {
+            let zone_s = self.ends.windows[*window].zone.len() as f64 * self.ends.step_ns as f64 * 1e-9;
+            looked.tried += response.trials_hz * zone_s;
+            // The highest of each part: that of all tells whether the transient is in the zone, the others what other
+            // places could have made there.
+            for (part, sizes) in sizes.chunks(same_rows).enumerate() {
+                let highest = sizes.iter().enumerate().filter(|(_, x)| x.is_finite());
+                let Some((k, size)) = highest.max_by(|a, b| a.1.total_cmp(b.1)) else { continue };
+                let (row, significance) = (part * same_rows + k, size / louder);
+                if significance > LEAST {
+                    looked.peaks.push(Peak { template, window: *window, row, significance });
+                }
+            }
+        }
+        looked
+    }
+
     /// What a template adds to the innovations.
-    fn response(
-        &self,
-        template: usize,
-        responses: &[Vec<Vec<Complex64>>],
-        averaging: &[Complex64],
-        fft: &Transforms,
-    ) -> Response {
-        let template = &self.templates[template];
-        let n = 2 * self.length;
+    fn response(&self, template: usize) -> Response {
+        let Self { ends, fft, responses, averaging } = self;
+        let template = &ends.templates[template];
+        let n = 2 * ends.length;
         let mut kernel = template.kernel.clone();
         kernel.resize(n, 0.0);
         let kernel = fft.spectrum(kernel);
         let averaged: Vec<Complex64> = kernel.iter().zip(averaging).map(|(x, mean)| x * mean).collect();
-        let mut energy = vec![0.0; self.length + 1];
+        let mut energy = vec![0.0; ends.length + 1];
         let mut power = vec![0.0; n / 2 + 1];
-        let conjugate = (0..self.channels)
+        let conjugate = (0..ends.channels)
             .map(|to| {
                 let mut spectrum = vec![Complex64::default(); n / 2 + 1];
                 for (from, factor, is_averaged) in &template.channels {
@@ -253,7 +317,7 @@ impl Ends {
                 }
                 let mut samples = fft.samples(spectrum);
                 samples.iter_mut().for_each(|x| *x /= n as f64);
-                samples[self.length..].fill(0.0);
+                samples[ends.length..].fill(0.0);
                 energy[1..].iter_mut().zip(&samples).for_each(|(e, x)| *e += x * x);
                 let spectrum = fft.spectrum(samples);
                 power.iter_mut().zip(&spectrum).for_each(|(p, x)| *p += x.norm_sqr());
@@ -267,26 +331,37 @@ impl Ends {
         }
         let whole = power.iter().sum::<f64>().max(f64::MIN_POSITIVE);
         let turning: f64 = power.iter().enumerate().map(|(k, p)| p * (k as f64 / n as f64).powi(2)).sum();
-        let spread_hz = (turning / whole).sqrt() * 1e9 / self.step_ns as f64;
+        let spread_hz = (turning / whole).sqrt() * 1e9 / ends.step_ns as f64;
         Response { conjugate, energy, trials_hz: TAU.sqrt() * LOUD * spread_hz }
     }
 
     /// Size of the output of a template's filter over its σ at every row of a window; not finite where nothing is left
     /// of the response.
-    fn sizes(&self, w: usize, response: &Response, spectra: &[Vec<Complex64>], fft: &Transforms) -> Vec<f64> {
-        let rows = self.windows[w].rows.len() / self.channels;
-        let mut sum = vec![Complex64::default(); self.length + 1];
+    fn sizes(&self, w: usize, response: &Response, spectra: &[Vec<Complex64>]) -> Vec<f64> {
+        let rows = self.ends.windows[w].rows.len() / self.ends.channels;
+        let mut sum = vec![Complex64::default(); self.ends.length + 1];
         for (h, e) in response.conjugate.iter().zip(spectra) {
             sum.iter_mut().zip(h.iter().zip(e)).for_each(|(sum, (h, e))| *sum += h * e);
         }
-        let samples = fft.samples(sum);
-        let n = 2.0 * self.length as f64;
+        let samples = self.fft.samples(sum);
+        let n = 2.0 * self.ends.length as f64;
         (0..rows).map(|k| (samples[k] / (n * response.energy[rows - k].sqrt())).abs()).collect()
     }
 
-    /// Rows in [`SAME_S`].
-    fn same_rows(&self) -> usize {
-        (SAME_S * 1e9 / self.step_ns as f64) as usize
+    /// Takes a transient off the rows of its window, with the size of least squares.
+    fn take_off(&self, peak: &Peak, rows: &mut [f64]) {
+        let response = self.response(peak.template);
+        let n = 2.0 * self.ends.length as f64;
+        let channels = self.ends.channels;
+        let added = |conjugate: Vec<Complex64>| self.fft.samples(conjugate.iter().map(Complex64::conj).collect());
+        let added: Vec<Vec<f64>> = response.conjugate.into_iter().map(added).collect();
+        let after = &mut rows[peak.row * channels..];
+        let energy = response.energy[after.len() / channels];
+        let sum = |c: usize| after.iter().skip(c).step_by(channels).zip(&added[c]).map(|(e, h)| e * h / n).sum::<f64>();
+        let size = (0..channels).map(sum).sum::<f64>() / energy;
+        for (c, h) in added.iter().enumerate() {
+            after.iter_mut().skip(c).step_by(channels).zip(h).for_each(|(e, h)| *e -= size * h / n);
+        }
     }
 }
 

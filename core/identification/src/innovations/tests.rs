@@ -9,7 +9,7 @@ use super::decision::{Candidate, Evidence, Prior, Quadratic, disagreement};
 use super::filter::{FREE, Innovations, POWERS, Parameter, Passed, Setup, Sums};
 use super::predictor::Predictor;
 use super::state_space::{NoisePoint, NoiseStates};
-use crate::transient::Template;
+use crate::transient::{Template, Transients};
 
 const DT_S: f64 = 0.1;
 const STEP_NS: i64 = 100_000_000;
@@ -963,51 +963,94 @@ fn a_rate_has_the_sums_of_a_series_that_grows_with_time() {
     }
 }
 
+/// A template of one unit in the first channel for some samples.
+fn template(samples: usize) -> Template {
+    Template {
+        effect: "event".to_owned(),
+        instance: format!("of{samples}"),
+        coefficient: "event.here".to_owned(),
+        unit: "1".to_owned(),
+        shape: serde_json::Map::new(),
+        kernel: vec![1.0; samples],
+        channels: vec![(0, 1.0, false)],
+    }
+}
+
+/// What a search near the ends of stretches of data finds, and where it has looked, with events of five samples: at,
+/// size. A stretch is so many samples, and ten are missing behind it.
+fn searched(
+    stretches: &[usize],
+    events: &[(usize, f64)],
+    templates: Vec<Template>,
+    threads: usize,
+) -> (Transients, Vec<std::ops::Range<i64>>) {
+    let system = system();
+    let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
+    let mut data = drawn(&system, &predictor, stretches.iter().sum(), 3);
+    for (at, size) in events {
+        data.iter_mut().skip(*at).take(5).for_each(|z| z[0] += size);
+    }
+    let mut pass = Innovations::new(Setup {
+        system: &system,
+        predictor: &predictor,
+        known: Vec::new(),
+        parameters: Vec::new(),
+        starts: Vec::new(),
+        series: 0,
+        averaged: false,
+        step_ns: STEP_NS,
+        block: None,
+        threads,
+    })
+    .with_search(templates);
+    let (mut ends, mut gap) = (stretches.iter().scan(0, |sum, n| Some(std::mem::replace(sum, *sum + n) + n)), 0);
+    let mut end = ends.next();
+    for (k, z) in data.iter().enumerate() {
+        if Some(k) == end {
+            (gap, end) = (gap + 10, ends.next());
+        }
+        pass.push((k as i64 + gap) * STEP_NS, z, &[]);
+    }
+    pass.transients()
+}
+
 /// A transient near either end of the data is found at its sample with the significance of least squares (within 4σ,
 /// false alarm 1e-4); without one there is none, and one in the middle is left to the search by spectra.
 #[test]
 fn transients_near_both_ends_are_found_at_their_times() {
-    let system = system();
-    let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
-    let template = Template {
-        effect: "event".to_owned(),
-        instance: "here".to_owned(),
-        coefficient: "event.here".to_owned(),
-        unit: "1".to_owned(),
-        shape: serde_json::Map::new(),
-        kernel: vec![1.0; 5],
-        channels: vec![(0, 1.0, false)],
-    };
     let samples = 80_000;
-    let found = |at: usize, size: f64| {
-        let mut data = drawn(&system, &predictor, samples, 3);
-        data.iter_mut().skip(at).take(5).for_each(|z| z[0] += size);
-        let mut pass = Innovations::new(Setup {
-            system: &system,
-            predictor: &predictor,
-            known: Vec::new(),
-            parameters: Vec::new(),
-            starts: Vec::new(),
-            series: 0,
-            averaged: false,
-            step_ns: STEP_NS,
-            block: None,
-            threads: 1,
-        })
-        .with_search(vec![template.clone()]);
-        data.iter().enumerate().for_each(|(k, z)| pass.push(k as i64 * STEP_NS, z, &[]));
-        pass.transients().0.detections
-    };
-    assert!(found(0, 0.0).is_empty());
+    let found = |events: &[(usize, f64)]| searched(&[samples], events, vec![template(5)], 1).0.detections;
+    assert!(found(&[]).is_empty());
     let size = 400.0;
     let significance = |at: usize| {
-        let [found] = &found(at, size)[..] else { panic!("at {at}") };
+        let [found] = &found(&[(at, size)])[..] else { panic!("at {at}") };
         assert_eq!(found.at_ns, at as i64 * STEP_NS);
         found.significance
     };
     let all: Vec<f64> = [20, 3000, samples - 3000, samples - 20].map(significance).to_vec();
     assert!(all.iter().all(|x| *x > 8.0 && (x - all[1]).abs() < 4.0), "{all:?}");
-    assert!(found(samples / 2, size).is_empty());
+    assert!(found(&[(samples / 2, size)]).is_empty());
+    // Two in one window are found at their times, with the significance of each alone (within 4σ of their difference).
+    let two = found(&[(3000, size), (12_000, 2.0 * size)]);
+    let times: Vec<i64> = two.iter().map(|d| d.at_ns / STEP_NS).collect();
+    assert_eq!(times, [12_000, 3000]);
+    assert!((two[1].significance - all[1]).abs() < 4.0, "{}", two[1].significance);
+    // So is one beside a ten times larger one that begins inside of the data, which the spectra find.
+    let beside = found(&[(3000, size), (28_000, 10.0 * size)]);
+    let [one] = &beside[..] else { panic!("{beside:?}") };
+    assert!(one.at_ns == 3000 * STEP_NS && (one.significance - all[1]).abs() < 4.0, "{}", one.significance);
+}
+
+/// Beside many gaps no more windows are kept than the first and the last ones, and what is found in them is the same to
+/// the last bit with any number of threads.
+#[test]
+fn the_search_beside_many_gaps_has_a_limit_and_one_result() {
+    let (stretches, events) = ([34_000; 12], [(1000, 400.0), (34_000 * 12 - 1000, 400.0)]);
+    let templates: Vec<Template> = [1, 2, 3, 5, 8, 13, 21].map(template).to_vec();
+    let (found, windows) = searched(&stretches, &events, templates.clone(), 1);
+    assert!(windows.len() <= 16 && windows.len() > 8, "{}", windows.len());
+    assert_eq!(found.detections.iter().filter(|d| d.instance == "of5").count(), 2, "{:?}", found.detections);
+    assert_eq!((found, windows), searched(&stretches, &events, templates, 3));
 }
 
 /// Errors of an offset, where another effect acts beside it with a size from what is known of it. Of 4000 draws the
