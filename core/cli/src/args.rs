@@ -17,7 +17,7 @@ pub(crate) const BATCH_ROWS: u32 = 4096;
 #[derive(Debug, Parser)]
 #[command(name = "dragfree", version, max_term_width = 100, arg_required_else_help = true)]
 #[command(after_help = "Exit codes: 0 done, 1 failed, 2 usage, 3 done with loss of data, \
-    4 done but the model is inconsistent with the data.")]
+    4 done, but the data contradict the model, a test fails or an alert is raised.")]
 pub(crate) struct Arguments {
     /// What to do.
     #[command(subcommand)]
@@ -197,7 +197,7 @@ Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A question, as
 #[derive(Debug, Args)]
 #[command(after_help = EFFECTS)]
 pub(crate) struct Simulate {
-    /// Mission file, or the name of one that comes with the program: taiji
+    /// Mission file, or the name of one that comes with the program: taiji, taiji-thrusters, lisa, single
     #[arg(value_name = "MISSION.toml")]
     pub(crate) mission: PathBuf,
     /// Folder for the telemetry

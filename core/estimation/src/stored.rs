@@ -56,7 +56,7 @@ pub enum StoredError {
     #[error("these are no sums of a day: {0}")]
     Json(#[from] serde_json::Error),
     /// Another version.
-    #[error("stored sums have format {found}, this program reads {FORMAT}: run the day again")]
+    #[error("stored sums have format {found}, this program reads 2 to {FORMAT}: run the day again")]
     Format { found: u32 },
     /// Sizes that contradict each other, or numbers that are none.
     #[error("stored sums contradict themselves ({0}): the file is damaged, run the day again")]

@@ -43,6 +43,9 @@ pub(crate) const MEDIAN: f64 = 0.674_49;
 /// information below 2 mHz rings for half an hour on either side. A second, smaller event within it is not detected.
 const NEAR_S: [f64; 2] = [120.0, 1800.0];
 
+/// Begins that are nearer to each other than this, s, may be those of one transient with two profiles.
+pub const PROFILE_S: f64 = 600.0;
+
 /// Peaks that are kept.
 const MOST: usize = 50;
 

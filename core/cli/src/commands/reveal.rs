@@ -96,8 +96,8 @@ fn verdict(score: &Score, paint: Paint) -> String {
             notes.push(format!("named as what cannot be told from {}", e.confounder_of.join(", ")));
         }
         if !e.drivers.is_empty() {
-            let rank = e.driver_rank.map_or("not among the witnesses".to_owned(), |rank| format!("witness {rank}"));
-            notes.push(format!("driven by {}: {rank}", e.drivers.join(" and ")));
+            let rank = e.driver_rank.map_or("not there".to_owned(), |rank| format!("number {rank}"));
+            notes.push(format!("driven by {}: {rank} under `coherent with`", e.drivers.join(" and ")));
         }
         for limit in e.limits.iter().filter(|_| !e.accepted) {
             let (unit, factor) = text::readable_unit(&limit.unit);

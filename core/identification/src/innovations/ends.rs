@@ -15,7 +15,7 @@ use std::ops::Range;
 use realfft::num_complex::Complex64;
 
 use super::lanes::Kernel;
-use crate::transient::{Detection, LEAST, LOUD, MEDIAN, Template, Transforms, Transients};
+use crate::transient::{Detection, LEAST, LOUD, MEDIAN, PROFILE_S, Template, Transforms, Transients};
 
 /// Length of a window at an end of a stretch of data, s. The response of a push of a test mass lasts for about half an
 /// hour.
@@ -28,8 +28,7 @@ const ZONE: f64 = 0.75;
 const MOST_WINDOWS: usize = 16;
 /// Transients that are looked for in a window at most.
 const MOST_IN_A_WINDOW: usize = 4;
-/// Other places that may have made the same transient are tried at times that differ by less than this, s. What is
-/// nearer to a louder one may be what its template leaves of it, and is not looked for.
+/// Other places that may have made the same transient are tried at times that differ by less than this, s.
 const SAME_S: f64 = 300.0;
 
 /// Some consecutive innovations.
@@ -167,7 +166,8 @@ impl Ends {
             let peaks: Vec<Peak> = looked.into_iter().flat_map(|own| own.peaks).collect();
             open.retain(|w| {
                 let known = &mut taken_off[*w];
-                let is_new = |p: &&Peak| known.iter().all(|row| p.row.abs_diff(*row) >= self.same_rows());
+                // What is nearer may be what the template of a louder one has left of it.
+                let is_new = |p: &&Peak| known.iter().all(|row| p.row.abs_diff(*row) > self.rows_in(PROFILE_S));
                 let own: Vec<&Peak> = peaks.iter().filter(|p| p.window == *w).filter(is_new).collect();
                 let Some(loudest) = own.iter().max_by(|a, b| a.significance.total_cmp(&b.significance)) else {
                     return false;
@@ -191,7 +191,7 @@ impl Ends {
         if !window.zone.contains(&loudest.row) {
             return Vec::new();
         }
-        let near = |p: &&&Peak| window.zone.contains(&p.row) && p.row.abs_diff(loudest.row) < self.same_rows();
+        let near = |p: &&&Peak| window.zone.contains(&p.row) && p.row.abs_diff(loudest.row) < self.rows_in(SAME_S);
         let mut places: Vec<&Peak> = Vec::new();
         for peak in all.iter().filter(near) {
             let place = |p: &Peak| (&self.templates[p.template].effect, &self.templates[p.template].instance);
@@ -208,9 +208,8 @@ impl Ends {
         places.into_iter().map(detection).collect()
     }
 
-    /// Rows in [`SAME_S`].
-    fn same_rows(&self) -> usize {
-        (SAME_S * 1e9 / self.step_ns as f64) as usize
+    fn rows_in(&self, seconds: f64) -> usize {
+        (seconds * 1e9 / self.step_ns as f64) as usize
     }
 }
 
@@ -278,7 +277,7 @@ impl<'a> Look<'a> {
         *lowest = outputs.iter().filter_map(|sizes| level(sizes)).fold(*lowest, f64::min);
         let louder = lowest.max(1.0);
         let mut looked = Looked { peaks: Vec::new(), tried: 0.0 };
-        let same_rows = self.ends.same_rows();
+        let same_rows = self.ends.rows_in(SAME_S);
         for ((window, _), sizes) in windows.iter().zip(&outputs) {
             let zone_s = self.ends.windows[*window].zone.len() as f64 * self.ends.step_ns as f64 * 1e-9;
             looked.tried += response.trials_hz * zone_s;

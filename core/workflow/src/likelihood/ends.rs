@@ -6,7 +6,7 @@ use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::innovations::decision::{Candidate, Quadratic};
-use dragfree_identification::transient::{Detection, Template, Transients};
+use dragfree_identification::transient::{Detection, PROFILE_S, Template, Transients, is_one_transient};
 use dragfree_identification::waveform::Waveform;
 use dragfree_schema::{AT_NS, PREDICTION_NEED};
 
@@ -195,7 +195,7 @@ const FINE_S: f64 = 10.0;
 fn of_the_likeliest(events: &mut [Detection], best: &[usize], gains: &[f64], templates: &[Template], step_ns: i64) {
     let known = events.to_vec();
     for event in events {
-        let near = |d: &Detection| (d.at_ns - event.at_ns).abs() < SAME_NS;
+        let near = |d: &Detection| is_one_transient(d.at_ns, event.at_ns, PROFILE_S);
         let all = known.iter().zip(best).filter(|(d, _)| near(d));
         let Some((likeliest, _)) = all.max_by(|a, b| gains[*a.1].total_cmp(&gains[*b.1])) else { continue };
         let (Some(own), Some(other)) = (template(templates, event), template(templates, likeliest)) else { continue };
@@ -203,9 +203,6 @@ fn of_the_likeliest(events: &mut [Detection], best: &[usize], gains: &[f64], tem
         *event = event.of_course(&other.shape).moved(by * step_ns);
     }
 }
-
-/// Detections within this of each other are about one transient, ns.
-const SAME_NS: i64 = 600_000_000_000;
 
 /// Twice the gain in the logarithm of the likelihood of each of the last parameters of a pass by itself.
 fn gains(filtered: Filtered, waveforms: usize) -> Vec<f64> {
