@@ -75,8 +75,8 @@ pub enum Verdict {
     Wrong,
     /// A true cause is not found; no false cause is accepted.
     Missed,
-    /// All true causes are found and a false cause is accepted beside them; or nothing acts, and something is accepted or
-    /// reported as unexplained.
+    /// All true causes are found and a false cause is accepted beside them; or nothing acts, and something is accepted
+    /// or reported as unexplained.
     #[serde(rename = "false alarm")]
     FalseAlarm,
     /// No false cause is accepted, and the diagnosis rightly reports an unexplained residual.
