@@ -232,6 +232,20 @@ fn transients_near_the_ends_are_named_with_time_and_size() {
     }
 }
 
+/// A push of a test mass and a hit on the spacecraft within half an hour of the start: the louder one rings through both
+/// windows of the search, and the other is found with it taken off. Each momentum within 4σ (false alarm 1.3e-4).
+#[test]
+fn two_transients_near_the_start_are_both_named() {
+    let hidden = ["--effect", "impulse:tm2.y=2e-10,at_s=500", "--effect", "impulse:sc.x=8e-7,at_s=1900"];
+    let d = diagnosis(&[&["--hours", "3", "--seed", "9604"], &hidden[..]].concat());
+    assert_eq!(accepted(&d), ["impulse:tm2.y", "impulse:sc.x"], "{:#} {}", d["candidates"][0], d["reasons"]);
+    for (k, momentum) in [2e-10, 8e-7].into_iter().enumerate() {
+        let found = &d["candidates"][k];
+        let (value, sigma) = (found["value"].as_f64().expect("a value"), found["sigma"].as_f64().expect("a sigma"));
+        assert!((value - momentum).abs() < 4.0 * sigma && sigma < 0.1 * momentum, "{value} ± {sigma}");
+    }
+}
+
 /// Propellant slosh: instance, shape and size, and nothing else. Without its colouring in Σ the estimate is biased and
 /// a thruster gain appears.
 #[test]
