@@ -10,14 +10,14 @@ use dragfree_engine::examine::has_parameter;
 use dragfree_engine::run::Progress;
 use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::NoiseModel;
-use dragfree_identification::candidates::Candidate;
+use dragfree_identification::candidates::{Candidate, Coefficient};
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, retain_unexplained, screen};
 use dragfree_identification::slow_forces::{not_explained, slow_forces};
-use dragfree_identification::transient::{Detection, Transients, is_one_transient};
+use dragfree_identification::transient::{Detection, PROFILE_S, Transients, is_one_transient};
 use dragfree_schema::{AT_NS, FREQUENCY_HZ, NoiseProcess, Settings};
 use serde_json::json;
 
@@ -158,7 +158,7 @@ impl Spectra {
         record.gathered.lines = searched.lines.clone();
         let noise = record.noise_model()?;
         let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-        let screened = searched.detected.screen(&scorer, &[])?;
+        let screened = searched.detected.screen(&scorer, &[], &BTreeSet::new())?;
         Ok(Self { record, noise, screened, has_formulas: !proposals.is_empty() })
     }
 
@@ -188,6 +188,8 @@ struct Detected {
     near_ends: Vec<Detection>,
     /// The most significant at each place, and those at another time there.
     loudest: Vec<Detection>,
+    /// Others near the ends, at other times than those by more than a profile lasts.
+    further: Vec<Detection>,
     /// Two within this are one transient, s.
     same_s: f64,
 }
@@ -196,41 +198,70 @@ impl Detected {
     /// Those of the spectra, as many as the settings allow, and those near the ends.
     fn new(found: &Transients, near_ends: &Transients, settings: &Settings) -> Self {
         let same_s = settings.same_transient_s;
-        let (mut all, mut near, mut times_near) = (Vec::new(), Vec::new(), Vec::new());
-        let mut loudest: Vec<Detection> = Vec::new();
+        let (mut all, mut loudest, mut further): (Vec<Detection>, Vec<_>, Vec<_>) = Default::default();
+        let (mut near, mut times_near) = (Vec::new(), Vec::new());
         for detection in found.certain(settings.transient_p_value) {
             let at_an_end = near_ends.detections.contains(detection);
-            if loudest.iter().all(|other| !is_one(detection, other, same_s)) {
-                loudest.push(detection.clone());
-                // Of a transient near an end there is one detection for each place.
-                let is_one = |at_ns: &i64| is_one_transient(*at_ns, detection.at_ns, same_s);
-                let is_known = times_near.iter().any(is_one);
-                if at_an_end && (is_known || times_near.len() < settings.max_transients) {
-                    near.push(detection.clone());
-                    times_near.extend((!is_known).then_some(detection.at_ns));
-                }
-            }
             if !at_an_end && all.len() < settings.max_transients {
                 all.push(detection.clone());
             }
+            let is_first = loudest.iter().all(|other| !is_one(detection, other, same_s));
+            let mut others = loudest.iter().chain(&further);
+            let is_further = at_an_end && others.all(|other| !is_one(detection, other, PROFILE_S));
+            if is_first {
+                loudest.push(detection.clone());
+            } else if is_further {
+                further.push(detection.clone());
+            }
+            // Of a transient near an end there is one detection for each place.
+            let is_one = |at_ns: &i64| is_one_transient(*at_ns, detection.at_ns, PROFILE_S);
+            let is_known = times_near.iter().any(is_one);
+            if at_an_end && (is_first || is_further) && (is_known || times_near.len() < settings.max_transients) {
+                near.push(detection.clone());
+                times_near.extend((!is_known).then_some(detection.at_ns));
+            }
         }
         all.extend(near.iter().cloned());
-        Self { all, near_ends: near, loudest, same_s }
+        Self { all, near_ends: near, loudest, further, same_s }
+    }
+
+    /// The detection at a place that is tried there beside what is named: its own if the place is named, and else the
+    /// most significant one. Where that is what the place shows of a named transient, and the place is no rival of it,
+    /// one that is of none is tried.
+    fn tried_at(&self, place: &Coefficient, named: &[Candidate], rivals: &BTreeSet<String>) -> Option<&Detection> {
+        let others = place.times_beside(named);
+        let is_there = |d: &&Detection| place.is_at_place_of(&d.effect, &d.instance);
+        let is_new = |d: &&Detection| others.iter().all(|at_ns| !is_one_transient(d.at_ns, *at_ns, self.same_s));
+        let loudest = self.loudest.iter().filter(is_there).find(is_new)?;
+        let further = || self.further.iter().filter(is_there).filter(is_new);
+        if let Some(own) = named.iter().find(|c| (&c.effect, &c.instance) == (&place.effect, &place.instance)) {
+            return further().find(|d| Some(d.at_ns) == own.at_ns()).or(Some(loudest));
+        }
+        let is_named = |d: &Detection| {
+            let mut times = named.iter().filter_map(Candidate::at_ns);
+            times.any(|at_ns| is_one_transient(d.at_ns, at_ns, PROFILE_S))
+        };
+        let is_rival = rivals.contains(&format!("{}:{}", place.effect, place.instance));
+        let other = further().find(|d| !is_named(d)).filter(|_| is_named(loudest) && !is_rival);
+        other.or(Some(loudest))
     }
 
     /// The screen, with the transients near the ends in the form that the innovations have found: the spectra are
     /// tapered there.
-    fn screen(&self, scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Screened, WorkflowError> {
+    fn screen(
+        &self,
+        scorer: &CandidateScorer<'_>,
+        named: &[Candidate],
+        rivals: &BTreeSet<String>,
+    ) -> Result<Screened, WorkflowError> {
         let mut screened = screen(scorer, named)?;
         let (set, forms) = (scorer.candidate_set, &mut screened.forms);
         for place in set.places().iter().filter(|p| set.coefficients[p[0]].transient) {
             let first = &set.coefficients[place[0]];
-            let others = first.times_beside(named);
-            let is_new = |d: &&Detection| others.iter().all(|at_ns| !is_one_transient(d.at_ns, *at_ns, self.same_s));
-            let loudest = self.loudest.iter().filter(|d| first.is_at_place_of(&d.effect, &d.instance)).find(is_new);
-            let Some(loudest) = loudest.filter(|d| self.near_ends.contains(d)) else { continue };
+            let tried = self.tried_at(first, named, rivals);
+            let Some(tried) = tried.filter(|d| self.near_ends.contains(d)) else { continue };
             let possible = set.possible_forms(place, named, self.same_s);
-            let Some(own) = possible.into_iter().find(|k| first.forms[*k].shape == loudest.shape) else { continue };
+            let Some(own) = possible.into_iter().find(|k| first.forms[*k].shape == tried.shape) else { continue };
             let form = set.candidate(place, own);
             match forms.iter_mut().find(|f| f.name() == form.name()) {
                 Some(other) if other.transient => *other = form,
@@ -241,6 +272,12 @@ impl Detected {
         }
         Ok(screened)
     }
+}
+
+/// What the data do not tell from what is named.
+fn rivals(decided: &Decided, settings: &Settings) -> BTreeSet<String> {
+    let all = decided.selection.chosen.iter().flat_map(|f| &f.alternatives);
+    all.filter(|(_, p)| *p > settings.false_alarm).map(|(c, _)| decided.candidates[*c].name()).collect()
 }
 
 /// Whether two detections at one place are of one transient.
@@ -322,7 +359,7 @@ fn decide(
         }
         if now != named {
             let scorer = spectra.scorer(settings);
-            let beside = searched.detected.screen(&scorer, &now)?;
+            let beside = searched.detected.screen(&scorer, &now, &rivals(&decided, settings))?;
             // A form that has changed is named in its new form, of which the spectra alone know a value.
             named = named_forms(&decided, &beside.forms);
             let fit = scorer.fit(&named)?;
@@ -584,6 +621,7 @@ fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Foun
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_identification::candidates::Form;
 
     fn detection(at_s: i64) -> Detection {
         Detection {
@@ -610,6 +648,48 @@ mod tests {
         let found = Transients { detections: all, tried: 1.0 };
         let detected = Detected::new(&found, &found, &Settings::default());
         assert_eq!(detected.near_ends.len(), 10);
+    }
+
+    /// A place shows a named transient of another place at 1800 s, and its own at 600 s, not as loud. Beside the named one
+    /// its own is tried, unless the place is a rival of it; and where its own is named it stays.
+    #[test]
+    fn a_place_near_an_end_is_tried_with_its_own_transient() {
+        let at = |instance: &str, at_s, significance| Detection {
+            instance: instance.to_owned(),
+            significance,
+            ..detection(at_s)
+        };
+        let all = vec![at("tm1.z", 1750, 43.0), at("sc.x", 1800, 40.0), at("sc.x", 600, 25.0)];
+        let found = Transients { detections: all, tried: 1.0 };
+        let detected = Detected::new(&found, &found, &Settings::default());
+        assert_eq!(detected.near_ends.len(), 3);
+        let place = Coefficient {
+            name: "impulse.sc.x".to_owned(),
+            effect: "impulse".to_owned(),
+            instance: "sc.x".to_owned(),
+            initial: 0.0,
+            prior_sigma: None,
+            estimate: false,
+            candidate: true,
+            transient: true,
+            forms: Vec::new(),
+            noise: String::new(),
+        };
+        let named = |instance: &str, at_s: i64| {
+            let shape = serde_json::Map::from_iter([(AT_NS.to_owned(), json!(1_000_000_000 * at_s))]);
+            let form = Form { shape, unit: String::new(), lower: None, upper: None, terms: Vec::new(), colours: None };
+            let (effect, instance) = ("impulse".to_owned(), instance.to_owned());
+            Candidate { effect, instance, transient: true, parts: vec![(0, form)] }
+        };
+        let tried = |named: &[Candidate], rivals: &[&str]| {
+            let rivals = rivals.iter().map(|name| (*name).to_owned()).collect();
+            detected.tried_at(&place, named, &rivals).map(|d| d.at_ns / 1_000_000_000)
+        };
+        assert_eq!(tried(&[], &[]), Some(1800));
+        assert_eq!(tried(&[named("tm1.z", 1750)], &[]), Some(600));
+        assert_eq!(tried(&[named("tm1.z", 1750)], &["impulse:sc.x"]), Some(1800));
+        assert_eq!(tried(&[named("tm1.z", 1750), named("sc.x", 600)], &[]), Some(600));
+        assert_eq!(tried(&[named("sc.x", 1800)], &[]), Some(1800));
     }
 
     /// Of two detections near an end within what one transient rings, the louder one is a candidate; of two ends, and
