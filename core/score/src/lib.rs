@@ -10,7 +10,8 @@ use std::collections::BTreeMap;
 /// Highest rank at which the true housekeeping channel counts as found, for causes that no effect covers.
 const MAX_DRIVER_RANK: usize = 3;
 
-/// Impulses of one instance closer than this are the same, s; the search keeps one peak within this distance.
+/// Impulses of one instance whose times are closer than this are the same, s; the search keeps one peak within this
+/// distance.
 const MAX_TIME_ERROR_S: f64 = 120.0;
 
 /// Name of an effect as in messages and confounders, `es-gain:tm1.y`.
@@ -489,15 +490,20 @@ struct Scorer<'a> {
 }
 
 impl Scorer<'_> {
-    /// Estimated minus true time of an impulse, s; `None` for other effects and for repeated events.
+    /// Estimated minus true time of an impulse, s; `None` for other effects and for repeated events. The time is the mean
+    /// of its profile where the candidate has one: data know the begin of a slow one no better than its rise.
     fn time_error_s(&self, candidate: &Value, truth: &Truth) -> Option<f64> {
         let at_s = truth.shape.get("at_s").and_then(Value::as_f64)?;
         // An antenna moves repeatedly.
         if truth.effect != "impulse" || ["sc.phi", "sc.theta", "sc.psi"].contains(&truth.instance.as_str()) {
             return None;
         }
-        let since_ns = candidate["shape"]["at_ns"].as_i64()? - self.sealed["start_ns"].as_i64()?;
-        Some(since_ns as f64 * 1e-9 - at_s)
+        let shape = &candidate["shape"];
+        let since_ns = shape["at_ns"].as_i64()? - self.sealed["start_ns"].as_i64()?;
+        // Of a difference of exponentials.
+        let later = |key: &str| Some(shape[key].as_f64()? - truth.shape.get(key)?.as_f64()?);
+        let longer_s: f64 = ["rise_s", "decay_s"].into_iter().filter_map(later).sum();
+        Some(since_ns as f64 * 1e-9 - at_s + longer_s)
     }
 
     /// Whether a candidate matches a truth: effect, instance and, for a transient, time.

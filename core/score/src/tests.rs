@@ -144,6 +144,21 @@ fn an_uncovered_cause_is_unexplained_with_its_driver() {
     assert!(!scored(&[hidden("time-offset", "is", 0.1, &json!({}))], &told).effects[0].covered);
 }
 
+/// The begin of a slow glitch is known to its rise: one that begins 140 s early and rises and decays so much more slowly
+/// that its mean time is right is the same, and one whose mean time is 200 s later is another.
+#[test]
+fn a_glitch_is_found_at_its_mean_time() {
+    let glitch = [hidden("impulse", "tm2.y", 1e-11, &json!({"at_s": 500.0, "rise_s": 5.0, "decay_s": 60.0}))];
+    let found = |decay_s: f64| {
+        let mut found = candidate("impulse:tm2.y", true, 1e-11, 1e-12, &[]);
+        found["shape"] = json!({"at_ns": 1_360_000_000_000_i64, "rise_s": 70.0, "decay_s": decay_s});
+        scored(&glitch, &diagnosis("missing", &[found]))
+    };
+    let (same, other) = (found(130.0), found(335.0));
+    assert!(same.verdict == Verdict::Right && (same.effects[0].time_error_s.unwrap() + 5.0).abs() < 1e-9);
+    assert_eq!(other.verdict, Verdict::Wrong);
+}
+
 /// A transient found at another time is another event.
 #[test]
 fn an_impulse_is_found_at_its_time() {
