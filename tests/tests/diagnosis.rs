@@ -232,8 +232,8 @@ fn transients_near_the_ends_are_named_with_time_and_size() {
     }
 }
 
-/// A push of a test mass and a hit on the spacecraft within half an hour of the start: the louder one rings through both
-/// windows of the search, and the other is found with it taken off. Each momentum within 4σ (false alarm 1.3e-4).
+/// A push of a test mass and a hit on the spacecraft within half an hour of the start: the louder one rings through
+/// both windows of the search, and the other is found with it taken off. Each momentum within 4σ (false alarm 1.3e-4).
 #[test]
 fn two_transients_near_the_start_are_both_named() {
     let hidden = ["--effect", "impulse:tm2.y=2e-10,at_s=500", "--effect", "impulse:sc.x=8e-7,at_s=1900"];

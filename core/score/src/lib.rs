@@ -490,8 +490,8 @@ struct Scorer<'a> {
 }
 
 impl Scorer<'_> {
-    /// Estimated minus true time of an impulse, s; `None` for other effects and for repeated events. The time is the mean
-    /// of its profile where the candidate has one: data know the begin of a slow one no better than its rise.
+    /// Estimated minus true time of an impulse, s; `None` for other effects and for repeated events. The time is the
+    /// mean of its profile where the candidate has one: data know the begin of a slow one no better than its rise.
     fn time_error_s(&self, candidate: &Value, truth: &Truth) -> Option<f64> {
         let at_s = truth.shape.get("at_s").and_then(Value::as_f64)?;
         // An antenna moves repeatedly.

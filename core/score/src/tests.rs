@@ -144,8 +144,8 @@ fn an_uncovered_cause_is_unexplained_with_its_driver() {
     assert!(!scored(&[hidden("time-offset", "is", 0.1, &json!({}))], &told).effects[0].covered);
 }
 
-/// The begin of a slow glitch is known to its rise: one that begins 140 s early and rises and decays so much more slowly
-/// that its mean time is right is the same, and one whose mean time is 200 s later is another.
+/// The begin of a slow glitch is known to its rise: one that begins 140 s early and rises and decays so much more
+/// slowly that its mean time is right is the same, and one whose mean time is 200 s later is another.
 #[test]
 fn a_glitch_is_found_at_its_mean_time() {
     let glitch = [hidden("impulse", "tm2.y", 1e-11, &json!({"at_s": 500.0, "rise_s": 5.0, "decay_s": 60.0}))];

@@ -650,8 +650,8 @@ mod tests {
         assert_eq!(detected.near_ends.len(), 10);
     }
 
-    /// A place shows a named transient of another place at 1800 s, and its own at 600 s, not as loud. Beside the named one
-    /// its own is tried, unless the place is a rival of it; and where its own is named it stays.
+    /// A place shows a named transient of another place at 1800 s, and its own at 600 s, not as loud. Beside the named
+    /// one its own is tried, unless the place is a rival of it; and where its own is named it stays.
     #[test]
     fn a_place_near_an_end_is_tried_with_its_own_transient() {
         let at = |instance: &str, at_s, significance| Detection {
