@@ -149,14 +149,8 @@ pub fn model(
 }
 
 fn readout_noise(noise: &Noise, name: &str) -> Result<NoiseShape, MissionError> {
-    let table = match name {
-        "ifo_x" => &noise.ifo_x,
-        "is_x" => &noise.is_x,
-        "is_y" => &noise.is_y,
-        "is_z" => &noise.is_z,
-        _ => &None,
-    };
-    Mission::need(table, &format!("noise.{name}"), STAGE).map(DisplacementNoise::shape)
+    let table = noise.displacement(name).map(DisplacementNoise::shape);
+    table.ok_or_else(|| MissionError::Missing { section: format!("noise.{name}"), needed_by: STAGE })
 }
 
 /// Variance per second of the random walk whose one-sided PSD is the `1/f²` part of a shape, unit² s⁻¹.
@@ -389,6 +383,19 @@ mod tests {
         let crossover_hz = 0.2_f64.sqrt() / std::f64::consts::TAU;
         let left = power(0, crossover_hz) / power(0, 5.0);
         assert!((left - 0.5).abs() < 2e-3, "{left} of the torque noise is left at the crossover");
+    }
+
+    /// An interferometer may read any axis.
+    #[test]
+    fn an_interferometer_along_y_has_its_own_noise() {
+        let mut mission = taiji();
+        mission.noise.ifo_y = mission.noise.ifo_x.clone();
+        let of = |names: &[&str]| {
+            model(&mission, &["tm1"], names, vec![], &choices(1.0), &NoiseLevels::default()).expect("complete")
+        };
+        let model = of(&["ifo_x", "ifo_y", "is_z"]);
+        assert_eq!(model.readout_m2[1], model.readout_m2[0]);
+        assert!(of(&["ifo_x", "is_y", "is_z"]).readout_m2[1] > model.readout_m2[1]);
     }
 
     #[test]

@@ -93,11 +93,13 @@ impl HinfDfacs {
             let frame = self.mission.frame(name);
             let mut noise = INERTIAL_SENSOR;
             for (axis, letter) in AXES.into_iter().enumerate() {
+                // A column is there also where telemetry has a field for an instrument that the mission has not.
                 let want = grid(&format!("ifo.{name}.{letter}_orf_m"), "m", &frame);
-                let optical = link.read_if_available(available, &want)?;
+                let has_one = tm.has_interferometer(axis);
+                let optical = if has_one { link.read_if_available(available, &want)? } else { None };
                 if optical.is_some() {
                     noise[axis] = INTERFEROMETER[axis];
-                } else if tm.has_interferometer(axis) {
+                } else if has_one {
                     self.notes.push(format!("no interferometer for {name}.{letter}: the inertial sensor is used"));
                 }
                 readout.push(match optical {
@@ -109,7 +111,8 @@ impl HinfDfacs {
             for angle in ANGLES {
                 let dws = grid(&format!("dws.{name}.{angle}_orf_rad"), "rad", &frame);
                 let is = grid(&format!("is.{name}.att_orf_rad.{angle}"), "rad", &frame);
-                readout.push(match link.read_if_available(available, &dws)? {
+                let wavefront = if tm.has_interferometer(0) { link.read_if_available(available, &dws)? } else { None };
+                readout.push(match wavefront {
                     None => link.read_if_available(available, &is)?,
                     some => some,
                 });

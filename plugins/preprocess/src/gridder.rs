@@ -12,6 +12,7 @@ use crate::clock::{Epochs, Place, Rate};
 use crate::layout::{Mandatory, TableSpec};
 use crate::outliers::{self, BLOCK, MARGIN};
 use crate::series::{LATEST_NS, Reason, Series, Tally, Window};
+use dragfree_physics::mission::MOST_TEST_MASSES;
 use dragfree_sdk::state::{State, StateError};
 
 /// Duration of telemetry from which rates are measured, before and after the first mandatory row.
@@ -273,8 +274,8 @@ impl Gridder {
             0 => stated_ns.unwrap_or(usual_ns),
             measured => measured,
         };
-        // Up to half the grid's rate, with 5 % margin for jitter.
-        if spec.never_interpolated || interval_ns <= period_ns / 20 * 41 {
+        // Housekeeping at the grid's rate or above, with 5 % margin for jitter, has a value in every epoch.
+        if spec.never_interpolated || interval_ns <= period_ns / 20 * 21 {
             Class::Fast(Fast::new(spec.columns.len()))
         } else {
             Class::Slow(interval_ns)
@@ -540,6 +541,12 @@ impl Gridder {
         for (k, row) in rows.iter().enumerate() {
             if *row < self.emitted || *row < fast.last_row {
                 series.tally.add(Reason::Outside, 1);
+            } else if *row == fast.last_row && !series.spec.never_interpolated {
+                // Housekeeping may be faster than the grid: the last value of an epoch stands.
+                for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
+                    cells.as_mut_slice()[(row - base) as usize] = source.as_slice()[from + k];
+                }
+                series.tally.rows_placed += 1;
             } else if *row == fast.last_row {
                 // Two samples for one epoch: the clock slipped, and neither is used.
                 series.tally.add(Reason::Crowded, if fast.crowded { 1 } else { 2 });
@@ -745,11 +752,11 @@ impl Gridder {
     /// Counts usable epochs: those with all common mandatory columns, and with all of at least one test mass.
     fn summarise(&mut self, times: &[i64], window: std::ops::Range<usize>) {
         // Bits: one for the common columns, and two per test mass, for x by either readout and for its other columns.
-        const COMMON: u64 = 1 << 8;
-        let (one, each) = (|tm: u8| 1u64 << tm, |tm: u8| 1u64 << (2 + tm));
+        const COMMON: u64 = 1 << (2 * MOST_TEST_MASSES);
+        let (one, each) = (|tm: u8| 1u64 << tm, |tm: u8| 1u64 << (MOST_TEST_MASSES as u8 + tm));
         self.mask.clear();
-        self.mask.resize(times.len(), COMMON | each(0) | each(1));
-        let mut wanted = [0, 0];
+        self.mask.resize(times.len(), (0..MOST_TEST_MASSES as u8).map(each).fold(COMMON, |all, bit| all | bit));
+        let mut wanted = [0; MOST_TEST_MASSES];
         for (t, series) in self.tables.iter().enumerate() {
             let slow = Window::default();
             for (c, spec) in series.spec.columns.iter().enumerate() {

@@ -370,6 +370,50 @@ fn instruments_are_never_interpolated() {
     assert!(grid.tables[2][0].iter().enumerate().all(|(k, v)| v.is_nan() == (k % 6 != 0)));
 }
 
+/// Housekeeping faster than the grid, at its rate by a clock of its own, slower by less than half, and at half of it
+/// has a value in every epoch, and none of it is a loss.
+#[test]
+fn housekeeping_at_any_rate_has_a_value_in_every_epoch() {
+    for step in [DT / 2, DT / 10_001 * 10_000, DT / 2 * 3, 2 * DT] {
+        let mut tables = is_and_dws(3_000);
+        let samples = 3_000 * DT / step;
+        tables.push(telemetry("hk/field", &["value"], (0..samples).map(|k| START + k * step), 3));
+        let (grid, gridder) = run(&tables);
+        let missing = grid.tables[2][0].iter().filter(|v| v.is_nan()).count() as i64;
+        // Behind its last sample housekeeping that is interpolated is not known.
+        assert!(missing <= step / DT + 1, "{step}: {missing}");
+        assert_eq!(count(&gridder, 2, Reason::Crowded), 0);
+    }
+}
+
+/// Of three test masses each makes an epoch usable.
+#[test]
+fn an_epoch_is_used_with_any_of_three_test_masses() {
+    let masses = ["tm1", "tm2", "tm3"];
+    let names: Vec<String> = masses.iter().flat_map(|m| ["x", "y", "z"].map(|a| format!("{m}.r_orf_m.{a}"))).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    for complete in [0..3, 0..1, 2..3, 0..0] {
+        let (is, dws) = (columns("is", &names), columns("dws", &DWS[1..4]));
+        let spec = |name: &str, owned: &[_]| table_spec(name, &owned.iter().collect::<Vec<_>>(), true, &masses, None);
+        let mut gridder = Gridder::new(config(), vec![spec("is", &is), spec("dws", &dws)]);
+        let tables = vec![vec![Vec::new(); names.len()], vec![Vec::new(); 3]];
+        let mut grid = Grid { tables, ages: vec![Vec::new(); 2], ..Grid::default() };
+        let mut noise = Noise::new(7);
+        let times: Vec<i64> = steady(3_000).collect();
+        for (t, width) in [(0, names.len()), (1, 3)] {
+            let mut column = |c: usize| -> Vec<f64> {
+                let there = t == 1 || complete.contains(&(c / 3));
+                times.iter().map(|_| if there { 1e-9 * noise.gauss() } else { f64::NAN }).collect()
+            };
+            let values: Vec<Vec<f64>> = (0..width).map(&mut column).collect();
+            gridder.take(t, &times, &values.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        }
+        gridder.flush(&mut grid);
+        let expected = if complete.is_empty() { 0 } else { 3_000 };
+        assert_eq!(gridder.summary.used, expected, "{complete:?}");
+    }
+}
+
 #[test]
 fn status_limits_and_stuck_values_blank_their_columns() {
     let mut tables = is_and_dws(9_000);

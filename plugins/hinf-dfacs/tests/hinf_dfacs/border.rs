@@ -106,7 +106,14 @@ fn library_path() -> PathBuf {
 }
 
 fn create(library: &Library, parameters: &Value, needs: &[&str]) -> Instance {
-    let mission: Value = toml::from_str(include_str!("../../../../fixtures/missions/taiji.toml")).expect("TOML");
+    create_for(&taiji(), library, parameters, needs)
+}
+
+fn taiji() -> Value {
+    toml::from_str(include_str!("../../../../fixtures/missions/taiji.toml")).expect("TOML")
+}
+
+fn create_for(mission: &Value, library: &Library, parameters: &Value, needs: &[&str]) -> Instance {
     let mut all =
         json!({"angular_acceleration": "smoother", "compare_commands": true, "measure_noise": true, "warm_up_s": 60.0});
     for (key, value) in parameters.as_object().expect("an object") {
@@ -244,6 +251,23 @@ fn it_does_without_what_can_be_missing() {
     assert_eq!(run(&angles, &json!({}), 4096).report["commands"], "telemetered");
     let refusal = link_refusal(&angles.without("command"), &json!({}), &[]);
     assert!(refusal.contains("/command") && refusal.contains("replayed"), "{refusal}");
+}
+
+/// Telemetry has a field for the interferometer of each test mass; a mission may have none there.
+#[test]
+fn an_instrument_that_the_mission_has_not_is_not_read() {
+    let mut mission = taiji();
+    mission["test_mass"]["tm2"]["interferometer"] = json!([]);
+    let (library, grid) = (library(), Grid::of_the_loop(1));
+    let noise_of = |mission: &Value| -> Vec<String> {
+        let mut stage = create_for(mission, &library, &json!({}), &[]);
+        let linked = stage.link(LinkRequest { available: &grid.columns, model_json: "{}" }).expect("linked");
+        let columns = linked.writes.iter().flat_map(|table| &table.columns);
+        let of = |c: &Column| c.attributes.get("noise").filter(|_| c.name.ends_with(".accel.x")).cloned();
+        columns.filter_map(of).collect()
+    };
+    assert_eq!(noise_of(&taiji()), ["ifo_x", "ifo_x"]);
+    assert_eq!(noise_of(&mission), ["ifo_x", "is_x"]);
 }
 
 #[test]
