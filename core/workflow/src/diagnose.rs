@@ -502,7 +502,7 @@ fn answer(
     let forms = &screened.forms;
     let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
     let mut answers = Answers::new(settings, decided, evidence);
-    answers.refuse_stand_ins(decided, evidence, settings);
+    answers.refuse_stand_ins(settings, decided, evidence);
     let mut formulas = answers.take_formulas(evidence);
     formulas.extend(answers.refuse_like_formulas(settings, decided, evidence));
     answers.refuse_beside_formulas(decided, evidence);

@@ -415,7 +415,7 @@ pub(crate) fn levels_of_all(days: &[&[NoiseLevel]]) -> Vec<NoiseLevel> {
 
 fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence: &Evidence<'_>) -> Diagnosis {
     let mut answers = Answers::new(settings, decided, evidence);
-    answers.refuse_stand_ins(decided, evidence, settings);
+    answers.refuse_stand_ins(settings, decided, evidence);
     let levels: Vec<&[NoiseLevel]> = extracts.iter().map(Extract::levels).collect();
     let levels = with_levels(&mut answers.named, &levels_of_all(&levels), decided, evidence, settings);
     answers.sort_others();

@@ -5,6 +5,7 @@
 //! part of the errors.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::OnceLock;
 
 use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
@@ -152,6 +153,8 @@ pub(crate) struct Decided {
     pub(crate) quadratic: Quadratic,
     /// That of each product by itself; none where there is only one.
     pub(crate) by_product: Vec<Quadratic>,
+    /// The same without knowledge that is common to all products, once it was asked for.
+    data_of_products: OnceLock<Vec<Quadratic>>,
     pub(crate) chi2: f64,
     /// Minus twice the logarithm of the likelihood where the pass was made, with what is known before any data, up to a
     /// constant of the data.
@@ -205,13 +208,14 @@ impl Decided {
 
     /// What the data of each product say by themselves, without surveys and other knowledge of coefficients: that is
     /// common to all products, and values that rest on it would not be independent. None of one product.
-    pub(crate) fn data_of_products(&self) -> Vec<Quadratic> {
+    pub(crate) fn data_of_products(&self) -> &[Quadratic] {
         let of = |part: &Part| {
             let mut sums = Sums::zeros(self.parameters.len(), 0);
             part.add_to(&mut sums);
             Quadratic::new(&sums, &self.start, &self.level_priors(), self.quadratic.candidates().to_vec())
         };
-        if self.parts.len() > 1 { self.parts.iter().map(of).collect() } else { Vec::new() }
+        self.data_of_products
+            .get_or_init(|| if self.parts.len() > 1 { self.parts.iter().map(of).collect() } else { Vec::new() })
     }
 
     /// What is known of the noise levels before any data.
@@ -618,6 +622,7 @@ impl Joined {
             parts: self.parts,
             quadratic,
             by_product,
+            data_of_products: OnceLock::new(),
             chi2: sums.chi2,
             height,
             numbers: sums.numbers,
@@ -694,7 +699,7 @@ mod tests {
                 let [(a, a_sigma), (b, b_sigma)] = [0, 1].map(|k| of(&products[k]));
                 (a - b).powi(2) / (a_sigma.powi(2) + b_sigma.powi(2))
             };
-            alone += chi2(&decided.data_of_products()) / 1000.0;
+            alone += chi2(decided.data_of_products()) / 1000.0;
             surveyed += chi2(&decided.by_product) / 1000.0;
         }
         let bound = 4.0 * (2.0_f64 / 1000.0).sqrt();

@@ -43,12 +43,12 @@ impl Answers {
 
     /// The same of the effect at a place.
     fn refuse_place(&mut self, place: &Place, why: impl Fn(&Found) -> String) {
-        self.refuse(|f| (&f.effect, &f.instance) == (&place.effect, &place.instance), why);
+        self.refuse(|f| is_at(f, place), why);
     }
 
     /// Refuses what is named in the place of an effect that the data want outside of its physical range: that one is
     /// refused, and what is like it takes its place.
-    pub(crate) fn refuse_stand_ins(&mut self, decided: &Decided, evidence: &Evidence<'_>, settings: &Settings) {
+    pub(crate) fn refuse_stand_ins(&mut self, settings: &Settings, decided: &Decided, evidence: &Evidence<'_>) {
         let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
         let (range, more) = (settings.range_sigmas.powi(2), -settings.false_alarm.ln());
         for c in &set {
@@ -126,8 +126,7 @@ impl Answers {
     pub(crate) fn kept(&self, decided: &Decided, formulas: &[Found]) -> Vec<usize> {
         let is_kept = |c: &usize| {
             let place = &decided.candidates[*c];
-            let mut all = self.named.iter().chain(formulas);
-            all.any(|f| (&f.effect, &f.instance) == (&place.effect, &place.instance))
+            self.named.iter().chain(formulas).any(|f| is_at(f, place))
         };
         decided.selection.chosen.iter().map(|f| f.candidate).filter(is_kept).collect()
     }
@@ -150,6 +149,11 @@ impl Answers {
     pub(crate) fn into_candidates(self, most_others: usize) -> Vec<Found> {
         self.named.into_iter().chain(self.others.into_iter().take(most_others)).collect()
     }
+}
+
+/// Whether an effect is the one at a place.
+fn is_at(f: &Found, place: &Place) -> bool {
+    (&f.effect, &f.instance) == (&place.effect, &place.instance)
 }
 
 fn is_formula(f: &Found, evidence: &Evidence<'_>) -> bool {
@@ -291,7 +295,7 @@ mod tests {
             let decided = joined((0..4).map(|_| day()).collect(), &settings, &evidence, Vec::new());
             let mut answers = Answers::new(&settings, &decided, &evidence);
             let before = answers.named.clone();
-            answers.refuse_stand_ins(&decided, &evidence, &settings);
+            answers.refuse_stand_ins(&settings, &decided, &evidence);
             let offsets = offsets(&decided, &evidence, &answers.kept(&decided, &[]));
             Self { decided, answers, before, offsets }
         }

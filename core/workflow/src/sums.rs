@@ -61,6 +61,22 @@ pub(crate) struct Request<'a> {
     pub(crate) threads: usize,
 }
 
+/// A series with its last value where it has none, and how many measured rows have none. Before its first value, which
+/// `held` then lacks, so many rows may wait for it.
+fn hold(series: &[f64], measured: &[bool], held: &mut f64, patience: usize) -> (Vec<f64>, u64) {
+    let mut missing = 0;
+    let values = series.iter().zip(measured).enumerate().map(|(k, (x, measured))| {
+        if x.is_finite() {
+            *held = *x;
+        } else {
+            let waits = held.is_nan() && k < patience;
+            missing += u64::from(*measured && !waits);
+        }
+        *held
+    });
+    (values.collect(), missing)
+}
+
 /// Sums of the columns of a chain; takes their rows.
 pub(crate) struct ColumnSums {
     names: Vec<String>,
@@ -231,25 +247,8 @@ impl ColumnSums {
                 filled.push(Cow::Borrowed(column));
                 continue;
             }
-            let mut held = self.held[j];
-            let mut missing = 0;
-            filled.push(
-                column
-                    .iter()
-                    .zip(&measured)
-                    .enumerate()
-                    .map(|(k, (x, measured))| {
-                        if x.is_finite() {
-                            held = *x;
-                        } else {
-                            let waits = held.is_nan() && k < patience;
-                            missing += u64::from(*measured && !waits);
-                        }
-                        held
-                    })
-                    .collect(),
-            );
-            self.held[j] = held;
+            let (values, missing) = hold(column, &measured, &mut self.held[j], patience);
+            filled.push(Cow::Owned(values));
             self.missing[j] += missing;
         }
         let mut first = columns.first().map_or_else(Vec::new, |c| c.to_vec());
@@ -613,4 +612,31 @@ pub(crate) fn templates(available: &Available, channels: &[&Column], differenced
         }
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a series lacks is the same in any batches: rows before its first value beyond the patience, and later ones
+    /// that are measured.
+    #[test]
+    fn missing_values_do_not_depend_on_batches() {
+        let mut series = vec![f64::NAN; 40];
+        (15..40).filter(|k| k % 5 != 0).for_each(|k| series[k] = k as f64);
+        let measured: Vec<bool> = (0..40).map(|k| k != 25).collect();
+        for batch in [1, 7, 40] {
+            let (mut held, mut values, mut missing) = (f64::NAN, Vec::new(), 0);
+            for first in (0..40).step_by(batch) {
+                let rows = first..(first + batch).min(40);
+                let patience = 10_usize.saturating_sub(first);
+                let (own, lacks) = hold(&series[rows.clone()], &measured[rows], &mut held, patience);
+                values.extend(own);
+                missing += lacks;
+            }
+            // 10 to 15, 20, 30 and 35; in 25 nothing was measured.
+            assert_eq!(missing, 9, "batches of {batch}");
+            assert!(values[..16].iter().all(|x| x.is_nan()) && values[20] == 19.0 && values[39] == 39.0);
+        }
+    }
 }

@@ -541,13 +541,7 @@ impl Gridder {
         for (k, row) in rows.iter().enumerate() {
             if *row < self.emitted || *row < fast.last_row {
                 series.tally.add(Reason::Outside, 1);
-            } else if *row == fast.last_row && !series.spec.never_interpolated {
-                // Housekeeping may be faster than the grid: the last value of an epoch stands.
-                for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
-                    cells.as_mut_slice()[(row - base) as usize] = source.as_slice()[from + k];
-                }
-                series.tally.rows_placed += 1;
-            } else if *row == fast.last_row {
+            } else if *row == fast.last_row && series.spec.never_interpolated {
                 // Two samples for one epoch: the clock slipped, and neither is used.
                 series.tally.add(Reason::Crowded, if fast.crowded { 1 } else { 2 });
                 if !fast.crowded {
@@ -557,11 +551,12 @@ impl Gridder {
                 }
                 fast.cells.iter_mut().for_each(|c| c.as_mut_slice()[(row - base) as usize] = f64::NAN);
             } else {
+                // Of housekeeping faster than the grid the last value of an epoch stands.
                 for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
                     cells.as_mut_slice()[(row - base) as usize] = source.as_slice()[from + k];
                 }
+                fast.filled += u64::from(*row != fast.last_row);
                 (fast.last_row, fast.crowded) = (*row, false);
-                fast.filled += 1;
                 series.tally.rows_placed += 1;
             }
         }

@@ -575,7 +575,7 @@ pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64
     };
     let Some((information, score)) = data.first() else { return (0.0, 0) };
     let mut all = (information * 0.0, score * 0.0);
-    let (mut apart, mut values) = (0.0, 0);
+    let (mut apart, mut values) = (0.0, 0_usize);
     for (information, score) in data {
         all = (all.0 + information, all.1 + score);
         let (gain, n) = highest(information, score);
@@ -583,5 +583,5 @@ pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64
     }
     let (together, n) = highest(&all.0, &all.1);
     // Where a direction is near rounding in each, all together may know it and none alone.
-    ((apart - together).max(0.0), usize::saturating_sub(values, n))
+    ((apart - together).max(0.0), values.saturating_sub(n))
 }
