@@ -976,11 +976,11 @@ fn template(samples: usize) -> Template {
     }
 }
 
-/// What a search near the ends of stretches of data finds, and where it has looked, with events of five samples: at,
+/// What a search near the ends of stretches of data finds, and where it has looked, with events of so many samples: at,
 /// size. A stretch is so many samples, and ten are missing behind it.
 fn searched(
     stretches: &[usize],
-    events: &[(usize, f64)],
+    (events, length): (&[(usize, f64)], usize),
     templates: Vec<Template>,
     threads: usize,
 ) -> (Transients, Vec<std::ops::Range<i64>>) {
@@ -988,7 +988,7 @@ fn searched(
     let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
     let mut data = drawn(&system, &predictor, stretches.iter().sum(), 3);
     for (at, size) in events {
-        data.iter_mut().skip(*at).take(5).for_each(|z| z[0] += size);
+        data.iter_mut().skip(*at).take(length).for_each(|z| z[0] += size);
     }
     let mut pass = Innovations::new(Setup {
         system: &system,
@@ -1019,7 +1019,7 @@ fn searched(
 #[test]
 fn transients_near_both_ends_are_found_at_their_times() {
     let samples = 80_000;
-    let found = |events: &[(usize, f64)]| searched(&[samples], events, vec![template(5)], 1).0.detections;
+    let found = |events: &[(usize, f64)]| searched(&[samples], (events, 5), vec![template(5)], 1).0.detections;
     assert!(found(&[]).is_empty());
     let size = 400.0;
     let significance = |at: usize| {
@@ -1041,16 +1041,26 @@ fn transients_near_both_ends_are_found_at_their_times() {
     assert!(one.at_ns == 3000 * STEP_NS && (one.significance - all[1]).abs() < 4.0, "{}", one.significance);
 }
 
+/// What lasts for 20 minutes fits its own template at later times too, by the part of it that is common. Taken off with
+/// its size it is found once.
+#[test]
+fn a_long_transient_near_an_end_is_found_once() {
+    let length = 12_000;
+    let found = searched(&[80_000], (&[(2000, 20.0)], length), vec![template(length)], 1).0.detections;
+    let [one] = &found[..] else { panic!("{found:?}") };
+    assert!(one.at_ns.abs_diff(2000 * STEP_NS) < 100 * STEP_NS as u64 && one.significance > 20.0, "{one:?}");
+}
+
 /// Beside many gaps no more windows are kept than the first and the last ones, and what is found in them is the same to
 /// the last bit with any number of threads.
 #[test]
 fn the_search_beside_many_gaps_has_a_limit_and_one_result() {
     let (stretches, events) = ([34_000; 12], [(1000, 400.0), (34_000 * 12 - 1000, 400.0)]);
     let templates: Vec<Template> = [1, 2, 3, 5, 8, 13, 21].map(template).to_vec();
-    let (found, windows) = searched(&stretches, &events, templates.clone(), 1);
+    let (found, windows) = searched(&stretches, (&events, 5), templates.clone(), 1);
     assert!(windows.len() <= 16 && windows.len() > 8, "{}", windows.len());
     assert_eq!(found.detections.iter().filter(|d| d.instance == "of5").count(), 2, "{:?}", found.detections);
-    assert_eq!((found, windows), searched(&stretches, &events, templates, 3));
+    assert_eq!((found, windows), searched(&stretches, (&events, 5), templates, 3));
 }
 
 /// Errors of an offset, where another effect acts beside it with a size from what is known of it. Of 4000 draws the
