@@ -68,3 +68,32 @@ impl Record {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::coherence::HousekeepingCoherence;
+    use crate::scores::tests::{candidate_set, gathered};
+    use nalgebra::DMatrix;
+
+    /// Sums with other housekeeping, or with products about other values of it, are refused; like ones add.
+    #[test]
+    fn sums_of_other_housekeeping_do_not_add() {
+        let with = |names: &[&str], levels: &[f64]| {
+            let mut gathered = gathered(1, 20_000, &[(9000, 6.0)], 0.0);
+            let (names, plan) = (names.iter().map(|name| (*name).to_owned()).collect(), gathered.plan());
+            let whitening = vec![DMatrix::identity(2, 2); plan.bands.len()];
+            let residual = DMatrix::from_fn(2, 3, |i, j| f64::from(u8::from(i == j)));
+            gathered.housekeeping =
+                HousekeepingCoherence::new(names, Vec::new(), &plan, residual, whitening, Vec::new()).about(levels);
+            Record { candidate_set: candidate_set(), noise: Vec::new(), gathered, not_tried: Vec::new() }
+        };
+        let mut record = with(&["hk/a", "hk/b"], &[1.0, 2.0]);
+        for other in [with(&["hk/b", "hk/a"], &[1.0, 2.0]), with(&["hk/a", "hk/b"], &[1.0, 3.0])] {
+            let before = record.clone();
+            assert_eq!(record.add(&other), Err(Unlike("housekeeping")));
+            assert!(record == before);
+        }
+        assert_eq!(record.add(&with(&["hk/a", "hk/b"], &[1.0, 2.0])), Ok(()));
+    }
+}

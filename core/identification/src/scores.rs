@@ -553,7 +553,7 @@ fn neighbours<'a>(of: &Candidate, all: impl Iterator<Item = &'a Candidate>) -> V
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::candidates::{Coefficient, Form, Term};
     use crate::coherence::HousekeepingCoherence;
@@ -604,7 +604,7 @@ mod tests {
 
     /// A model of one coefficient. Candidates: transients at one time in the first channel, in both and in the second,
     /// and a lasting cause at the first's instance.
-    fn candidate_set() -> CandidateSet {
+    pub(crate) fn candidate_set() -> CandidateSet {
         let at = &[("at_ns", 1)];
         CandidateSet {
             channels: vec!["first".to_owned(), "second".to_owned()],
@@ -621,7 +621,7 @@ mod tests {
 
     /// Waveforms of some sizes at some samples, and `push` of the lasting series, whose correlation with the model's is
     /// 0.9.
-    fn gathered(seed: u64, samples: usize, events: &[(usize, f64)], push: f64) -> GramSums {
+    pub(crate) fn gathered(seed: u64, samples: usize, events: &[(usize, f64)], push: f64) -> GramSums {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut white = || -> Vec<f64> { (0..samples).map(|_| StandardNormal.sample(&mut rng)).collect() };
         let (mut first, mut second, model, mut lasting) = (white(), white(), white(), white());
