@@ -563,9 +563,9 @@ mod tests {
         assert_eq!(acting(Driver::Value(0)).len(), 1);
     }
 
-    /// A product has a memory if it explains more with one by more than `2 log` of their number n. Without a force each
-    /// does so with a probability of `P(χ² > 2 log n)` at most, all n together of less than 0.4: more than 22 of 30 sets
-    /// have a probability of 5e-5. If the best memory were taken, 25 would have one.
+    /// A product has a memory if it explains more with one by more than `2 log` of their number n. Without a force
+    /// each does so with a probability of `P(χ² > 2 log n)` at most, all n together of less than 0.4: more than 22 of
+    /// 30 sets have a probability of 5e-5. If the best memory were taken, 25 would have one.
     #[test]
     fn a_product_has_a_memory_by_chance_as_rarely_as_is_counted() {
         let (cause, other) = (wave(1.7, 0.1), wave(2.3, 0.7));
