@@ -443,3 +443,30 @@ fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence
         not_tried: Vec::new(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    /// What one day could not try is tried where two others have it, and is not listed as left out; what none could is.
+    #[test]
+    fn what_some_days_have_is_tried() {
+        let coefficient = |effect: &str| json!({ "name": format!("{effect}.sc"), "effect": effect, "instance": "sc", "unit": "1", "candidate": true });
+        let day = |effects: &[&str], not_tried: &[&str]| -> Extract {
+            let names: Vec<_> = not_tried.iter().map(|effect| (format!("{effect}:sc"), "it has gaps")).collect();
+            let n = effects.len();
+            serde_json::from_value(json!({
+                "format": FORMAT, "product": "p", "program": "0", "chi2": 1.0, "numbers": 1.0,
+                "coefficients": effects.iter().map(|effect| coefficient(effect)).collect::<Vec<_>>(),
+                "information": vec![1.0; n * (n + 1) / 2], "score": vec![1.0; n], "surveys": [], "channels": {},
+                "named": [], "levels": [], "trials": { "forms": {} }, "unexplained": null, "not_tried": names,
+            }))
+            .expect("an extract")
+        };
+        let days = [day(&["a", "b"], &["c"]), day(&["a", "b"], &["c"]), day(&["b"], &["a", "c"])];
+        let (sums, not_tried) = shared(&days, |_| false);
+        assert_eq!(not_tried.keys().collect::<Vec<_>>(), ["c:sc"]);
+        assert_eq!(sums.iter().map(|s| s.coefficients.len()).collect::<Vec<_>>(), [2, 2, 1]);
+    }
+}
