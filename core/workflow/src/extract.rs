@@ -452,7 +452,10 @@ mod tests {
     /// What one day could not try is tried where two others have it, and is not listed as left out; what none could is.
     #[test]
     fn what_some_days_have_is_tried() {
-        let coefficient = |effect: &str| json!({ "name": format!("{effect}.sc"), "effect": effect, "instance": "sc", "unit": "1", "candidate": true });
+        let coefficient = |effect: &str| {
+            let name = format!("{effect}.sc");
+            json!({ "name": name, "effect": effect, "instance": "sc", "unit": "1", "candidate": true })
+        };
         let day = |effects: &[&str], not_tried: &[&str]| -> Extract {
             let names: Vec<_> = not_tried.iter().map(|effect| (format!("{effect}:sc"), "it has gaps")).collect();
             let n = effects.len();
