@@ -253,6 +253,15 @@ fn a_command_of_the_operators_is_run_for_a_loss_of_data() {
     assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
     let told = std::fs::read_to_string(mission.path().join("told")).expect("the command was run");
     assert_eq!(told.trim(), "COM1B_2035-01-02_SC1_01_0001 2035-01-02");
+    // A single time of 1980 makes no days of the years since.
+    let recording = Recording::read(&mission.vault(3));
+    let mut messages = recording.messages().to_vec();
+    let middle = messages.len() / 2;
+    messages[middle].log_time = 316_000_000_000_000_000;
+    recording.write_all(&mission.inbox("stray.mcap"), messages);
+    let dry = json(dragfree(mission.path()).args(["catch-up", "--dry-run", "--json"]), 0);
+    let due: Vec<&Value> = dry["days"].as_array().expect("days").iter().map(|day| &day["day"]).collect();
+    assert_eq!(due, ["2035-01-03"]);
     // From elsewhere, the file of operations names the archive; beside --archive it would be a second answer.
     let elsewhere = tempfile::tempdir().expect("a temporary folder");
     let list = || {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Changes with the tables: a catalogue of another version is made again.
-const VERSION: i64 = 3;
+const VERSION: i64 = 4;
 
 /// How long a question waits for another program's transaction, which takes milliseconds.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -28,6 +28,7 @@ CREATE INDEX products_by_day ON products (day, spacecraft, name, release, revisi
 CREATE TABLE files (
     id TEXT NOT NULL, suffix TEXT NOT NULL, sha256 TEXT NOT NULL, size INTEGER NOT NULL, PRIMARY KEY (id, suffix)
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE extracts (sha256 TEXT PRIMARY KEY) STRICT, WITHOUT ROWID;
 CREATE TABLE inputs (
     id TEXT NOT NULL, place INTEGER NOT NULL, role TEXT NOT NULL, name TEXT NOT NULL, sha256 TEXT NOT NULL,
     size INTEGER NOT NULL, PRIMARY KEY (id, place)
@@ -369,6 +370,7 @@ impl Catalogue {
     /// Whether any event names a content.
     pub(crate) fn names(&self, sha256: &str) -> Result<bool, ArchiveError> {
         let question = "SELECT EXISTS (SELECT 1 FROM files WHERE sha256 = ?1) \
+             OR EXISTS (SELECT 1 FROM extracts WHERE sha256 = ?1) \
              OR EXISTS (SELECT 1 FROM made_of WHERE sha256 = ?1) \
              OR EXISTS (SELECT 1 FROM products WHERE sha256 = ?1)";
         self.connection.query_row(question, [sha256], |row| row.get(0)).map_err(|e| self.error(e))
@@ -542,7 +544,11 @@ fn enter_event(
                 }
             }
         }
-        Event::Extract { id, sha256, size } => enter_file(connection, id, EXTRACT, sha256, *size)?,
+        Event::Extract { id, sha256, size } => {
+            // One that another has taken the place of stays among what the archive keeps.
+            connection.execute("INSERT OR IGNORE INTO extracts VALUES (?1)", [sha256])?;
+            enter_file(connection, id, EXTRACT, sha256, *size)?;
+        }
         Event::Failed { day, spacecraft, reason, tried_with } => {
             let values = params![day, spacecraft, reason, tried_with, number];
             connection.execute("INSERT OR REPLACE INTO failed VALUES (?1, ?2, ?3, ?4, ?5)", values)?;

@@ -319,6 +319,21 @@ fn a_catalogue_made_again_is_the_same() {
     assert_eq!(open(folder.path()).catalogue.dump(), before);
 }
 
+#[test]
+fn an_extract_that_was_replaced_is_no_stranger() {
+    let folder = tempfile::tempdir().expect("folder");
+    write(folder.path(), &product(0, "SC1", 1.0));
+    let mut archive = open(folder.path());
+    for content in ["{}", "[]"] {
+        archive.keep_extract(FIRST, content.as_bytes(), &stamp()).expect("kept");
+    }
+    assert!(archive.strangers().expect("objects").is_empty());
+    Archive::reindex(folder.path()).expect("reindex");
+    assert!(open(folder.path()).strangers().expect("objects").is_empty());
+    let first = archive.objects.path(&sha256("{}"));
+    assert_eq!(fs::read(first).expect("it is kept"), b"{}");
+}
+
 fn write_a_bit_of_everything(folder: &Path) {
     for (day, value) in [(0, 1.0), (1, 1.0), (0, 2.0)] {
         write(folder, &product(day, "SC1", value));

@@ -122,8 +122,8 @@ impl Feed for FileFeed {
     }
 
     fn span_ns(&self) -> Option<Range<i64>> {
-        let info = self.replay.info();
-        let (mut first, mut end) = (info.first_ns?, info.last_ns?.saturating_add(1));
+        let covered = &self.replay.info().covered_ns;
+        let (mut first, mut end) = (covered.first()?.start, covered.last()?.end);
         if let Some(window) = &self.window_ns {
             first = first.max(window.start);
             end = end.min(window.end);

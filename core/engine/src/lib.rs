@@ -86,3 +86,41 @@ pub enum EngineError {
     #[error("{} exists already and is not overwritten; choose another folder with --out, or remove it", path.display())]
     Exists { path: PathBuf },
 }
+
+impl EngineError {
+    /// Whether the machine is at fault, a disk or the memory, or somebody who wrote to a file meanwhile: the same run may
+    /// succeed another time.
+    pub fn may_pass(&self) -> bool {
+        use chain::ChainError;
+        use config::ConfigError;
+        use replay::ReplayError;
+        matches!(
+            self,
+            Self::Io(_)
+                | Self::Archive(_)
+                | Self::Stopped
+                | Self::Write(telemetry::WriteError::Io { .. })
+                | Self::Replay(ReplayError::Io { .. } | ReplayError::Changed { .. })
+                | Self::Config(ConfigError::Read { .. })
+                | Self::Chain(
+                    ChainError::Sink(_) | ChainError::Recording { .. } | ChainError::Config(ConfigError::Read { .. })
+                )
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_machine_refuses_may_pass_and_what_the_data_lack_does_not() {
+        let source = || std::io::Error::from_raw_os_error(5);
+        let path = PathBuf::from("a.mcap");
+        assert!(EngineError::from(replay::ReplayError::Io { path: path.clone(), source: source() }).may_pass());
+        assert!(EngineError::from(telemetry::WriteError::Io { path: path.clone(), source: source() }).may_pass());
+        assert!(EngineError::from(chain::ChainError::Sink("no space".to_owned())).may_pass());
+        assert!(!EngineError::from(replay::ReplayError::NotMcap { path: path.clone() }).may_pass());
+        assert!(!EngineError::NoRows { files: vec![path] }.may_pass());
+    }
+}

@@ -445,8 +445,12 @@ fn keep(path: &Path, text: &str) -> Result<(), RevisionError> {
     let write = || {
         let folder = folder_of(path);
         fs::create_dir_all(folder)?;
-        // We hold the lock, so this file is ours, or what a kill left.
         let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
+        // We hold the lock, so this file is what a kill left. It may be read-only already.
+        match fs::remove_file(&partial) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
         let mut file = File::create(&partial)?;
         file.write_all(text.as_bytes())?;
         let mut permissions = file.metadata()?.permissions();

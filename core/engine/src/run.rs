@@ -187,21 +187,19 @@ impl<'a> Setup<'a> {
         progress: &mut dyn FnMut(Progress),
     ) -> Result<Covered, EngineError> {
         let end_ns = feed.span_ns().map(|span| span.end).filter(|end| *end != i64::MAX);
-        let mut covered: Option<Covered> = None;
+        let from_ns = self.options.run_in_until_ns().unwrap_or(i64::MIN);
+        let mut carried = Carried::default();
         while let Some(chunk) = feed.next()? {
-            let run_in_until_ns = self.options.run_in_until_ns().unwrap_or(i64::MIN);
-            if let Some((first_ns, last_ns)) = extent(&chunk).filter(|(_, last_ns)| *last_ns >= run_in_until_ns) {
-                let first_ns = first_ns.max(run_in_until_ns);
-                let covered = covered.get_or_insert(Covered { first_ns, last_ns });
-                covered.last_ns = covered.last_ns.max(last_ns);
-                progress(Progress { until_ns: last_ns, first_ns: covered.first_ns, end_ns });
+            carried.add(&chunk, from_ns);
+            if let Some(Covered { first_ns, last_ns }) = carried.covered() {
+                progress(Progress { until_ns: last_ns, first_ns, end_ns });
             }
             chain.feed(chunk, sink)?;
             stop::check()?;
         }
         // What waits now waits for rows to come, however the feed was cut: so it can be saved.
         chain.settle(sink)?;
-        covered.ok_or_else(|| EngineError::NoRows { files: self.options.files.clone() })
+        carried.covered().ok_or_else(|| EngineError::NoRows { files: self.options.files.clone() })
     }
 }
 
@@ -326,16 +324,33 @@ fn log(setup: &Setup<'_>, chain: &Chain) {
     }
 }
 
-/// Rows that went into the chain.
+/// The time of the rows that went into the chain.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Covered {
     first_ns: i64,
     last_ns: i64,
 }
 
-/// First and last time of the densest table of a chunk: slow tables may begin long before.
-fn extent(chunk: &Chunk) -> Option<(i64, i64)> {
-    let densest = chunk.batches.iter().max_by_key(|b| b.rows())?;
-    Some((*densest.time_ns.first()?, *densest.time_ns.last()?))
+/// Rows of each table that went into the chain: how many, and their time.
+#[derive(Default)]
+struct Carried(Vec<(usize, Option<Covered>)>);
+
+impl Carried {
+    /// Adds the rows from `from_ns` on of a chunk.
+    fn add(&mut self, chunk: &Chunk, from_ns: i64) {
+        self.0.resize(chunk.batches.len(), (0, None));
+        for ((rows, covered), batch) in self.0.iter_mut().zip(&chunk.batches) {
+            let times = &batch.time_ns[batch.time_ns.partition_point(|time| *time < from_ns)..];
+            let (Some(&first_ns), Some(&last_ns)) = (times.first(), times.last()) else { continue };
+            *rows += times.len();
+            covered.get_or_insert(Covered { first_ns, last_ns }).last_ns = last_ns;
+        }
+    }
+
+    /// The time of the densest table: slow ones may begin long before, and housekeeping goes on after an instrument.
+    fn covered(&self) -> Option<Covered> {
+        self.0.iter().max_by_key(|(rows, _)| *rows)?.1
+    }
 }
 
 /// The state for the next day, written beside its place and renamed: a kill leaves the old state or the new one.
@@ -493,4 +508,30 @@ fn inputs(setup: &Setup<'_>, feed: &mut dyn Feed, state: Option<&[u8]>) -> Resul
     let state = setup.options.state_in.iter().zip(state);
     inputs.extend(state.map(|(path, bytes)| named("state", path, bytes)));
     Ok(inputs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::table::Batch;
+
+    #[test]
+    fn a_product_covers_the_time_of_its_densest_table() {
+        let batch = |times: &[i64]| Batch { time_ns: times.to_vec(), ..Batch::empty(0) };
+        let chunk = |dense: &[i64], slow: &[i64]| Chunk {
+            batches: vec![batch(dense), batch(slow)],
+            complete_until_ns: i64::MAX,
+        };
+        let mut carried = Carried::default();
+        for (dense, slow) in [(&[][..], &[1, 9][..]), (&[10, 11, 12, 13], &[11]), (&[14, 15], &[]), (&[], &[90])] {
+            carried.add(&chunk(dense, slow), 0);
+        }
+        assert_eq!(carried.covered(), Some(Covered { first_ns: 10, last_ns: 15 }));
+
+        let mut after_run_in = Carried::default();
+        after_run_in.add(&chunk(&[1, 2], &[3]), 5);
+        assert_eq!(after_run_in.covered(), None);
+        after_run_in.add(&chunk(&[4, 6, 7], &[5]), 5);
+        assert_eq!(after_run_in.covered(), Some(Covered { first_ns: 6, last_ns: 7 }));
+    }
 }

@@ -11,7 +11,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
 use crate::columns::alpha_is_commanded;
-use crate::common::{TEST_MASSES, TM_YZ, axis_of, manifest};
+use crate::common::{AXES, TEST_MASSES, TM_YZ, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
     axis_pair, latest_column, offset_coupling_terms, offset_terms, tm_acceleration, unpredicted,
@@ -34,6 +34,13 @@ fn second_difference_terms(
     (from, to): (usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
     let tm = &Body::of(mission, instance, by)?;
+    let readout = latest_column(available, &InputColumn::displacement(tm, to).name);
+    if readout.is_some_and(|c| c.attribute("noise").starts_with("ifo")) {
+        return Err(PluginError::error(format!(
+            "{by}: {} of {} is read by an interferometer, not by the inertial sensor; remove the effect from the model",
+            AXES[to], tm.name
+        )));
+    }
     let predicts = unpredicted(available, &InputColumn::known_accel(tm, from)).is_some();
     if from == 2 && !predicts {
         let normal = Normal::of(available, mission, by)?;
@@ -246,7 +253,6 @@ impl LinearEffect for TimeOffset {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::common::AXES;
     use crate::test_spacecraft::{TestSpacecraft, setup};
     use nalgebra::{Matrix3, Vector3};
 
@@ -326,6 +332,23 @@ mod tests {
         }
         let error = TiltToLength::coefficients(&setup("tm1", ""), &test_spacecraft.mission, &available).unwrap_err();
         assert!(error.message().contains("x of tm1 is read by the inertial sensor"), "{}", error.message());
+    }
+
+    #[test]
+    fn effects_of_the_inertial_sensor_need_it() {
+        let test_spacecraft = TestSpacecraft::new();
+        let mut available = test_spacecraft.available();
+        let y = InputColumn::displacement(&Body::of(&test_spacecraft.mission, "tm2.y", "a test").unwrap(), 1).name;
+        for column in available.columns.iter_mut().filter(|c| c.name == y) {
+            column.attributes.insert("noise".to_owned(), "ifo_y".to_owned());
+        }
+        for error in [
+            IsScale::coefficients(&setup("tm2.y", ""), &test_spacecraft.mission, &available).unwrap_err(),
+            IsCrosstalk::coefficients(&setup("tm2.x-y", ""), &test_spacecraft.mission, &available).unwrap_err(),
+        ] {
+            assert!(error.message().contains("y of tm2 is read by an interferometer"), "{}", error.message());
+        }
+        IsScale::coefficients(&setup("tm1.y", ""), &test_spacecraft.mission, &available).unwrap();
     }
 
     #[test]

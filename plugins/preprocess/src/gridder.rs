@@ -62,7 +62,8 @@ pub(crate) trait Sink {
 struct Run {
     bits: u64,
     length: u32,
-    /// Whether the column has been nonzero; a column that is zero throughout counts as not measured.
+    /// Whether the column has been nonzero. One that is zero throughout is not stuck: producers leave zero what they do
+    /// not measure.
     moved: bool,
 }
 

@@ -352,7 +352,10 @@ fn notes(gridder: &Gridder, summaries: &[TableSummary], config: &Config) -> Vec<
         }
         if !l.absent.is_empty() {
             let columns = l.absent.join(", ");
-            notes.push(format!("{table}: {columns} are zero throughout and count as not measured"));
+            notes.push(format!(
+                "{table}: {columns} are zero throughout and go on as zeros; where nothing measures them, the mission file \
+                 must not say that they are read"
+            ));
         }
     }
     notes

@@ -7,6 +7,7 @@
 
 mod block;
 mod clock;
+mod covered;
 mod inflate;
 mod losses;
 mod reader;
@@ -92,10 +93,9 @@ pub struct ReplayInfo {
     pub time_scale: String,
     /// Spacecraft; empty when no file says.
     pub spacecraft: String,
-    /// First log time of all files that the chunks state, Unix ns, before any window.
-    pub first_ns: Option<i64>,
-    /// Last log time of all files that the chunks state, Unix ns.
-    pub last_ns: Option<i64>,
+    /// Stretches without a gap of more than a day in which the files have messages, Unix ns, in order, before any
+    /// window; a few messages by themselves are left out, as they are dropped.
+    pub covered_ns: Vec<Range<i64>>,
 }
 
 /// A replay under way.
@@ -175,8 +175,14 @@ impl Replay {
             }
         }
         let mut files = scans;
-        files.sort_by_cached_key(|(input, scan)| (times(scan).map(|t| t.0), input.path().to_owned()));
-        let info = info(&files, &mut losses)?;
+        files.sort_by_cached_key(|(input, scan)| (first_time(scan), input.path().to_owned()));
+        let mut info = info(&files, &mut losses)?;
+        for (input, scan) in &files {
+            let covered = covered::covered(input, &scan.pieces);
+            info.covered_ns
+                .extend(covered.map_err(|source| ReplayError::Io { path: input.path().to_owned(), source })?);
+        }
+        info.covered_ns = covered::joined(info.covered_ns);
         let (tables, routes) = tables::link(&files, &mut losses)?;
         // Files that ended before their first channel are a loss, not the wrong files.
         if tables.is_empty() && !losses.data_loss() {
@@ -344,10 +350,9 @@ fn ahead(reader: Reader) -> Engine {
     }
 }
 
-/// First and last time that the pieces of a file state, as far as they are sane, Unix ns.
-fn times(scan: &Scan) -> Option<(i64, i64)> {
-    let stated = scan.pieces.iter().flat_map(|p| [p.start, p.end]).filter(|&t| is_sane(t)).map(clamp_ns);
-    stated.map(|t| (t, t)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+/// First time that the pieces of a file state, as far as they are sane, Unix ns.
+fn first_time(scan: &Scan) -> Option<i64> {
+    scan.pieces.iter().flat_map(|p| [p.start, p.end]).filter(|&t| is_sane(t)).map(clamp_ns).min()
 }
 
 /// Name of a file in findings: without its folder, so that a product does not depend on where its telemetry lay.
@@ -361,9 +366,6 @@ fn info(files: &[(Arc<InputFile>, Scan)], losses: &mut Losses) -> Result<ReplayI
     for (input, scan) in files {
         let path = input.path().to_owned();
         let name = name_of(&path);
-        let times = times(scan);
-        info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();
-        info.last_ns = info.last_ns.into_iter().chain(times.map(|t| t.1)).max();
         let Some(metadata) = &scan.metadata else {
             losses.add(Finding::FilesWithoutMetadata, u64::from(scan.bytes > 0), &name, || {
                 format!("{name} has no metadata record \"dragfree\": its spacecraft and time scale are taken on trust")

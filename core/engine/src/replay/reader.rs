@@ -26,9 +26,9 @@ const STRETCH_NS: i64 = 409_600_000_000;
 const HORIZON: i64 = 16 * STRETCH_NS;
 /// Most rows of a table in a stretch by itself that count as stray. A single time of 1980 would make the product one of
 /// that day.
-const STRAY_ROWS: usize = 3;
+pub(super) const STRAY_ROWS: usize = 3;
 /// Distance from all other rows from which they do, ns.
-const STRAY_NS: i64 = 86_400_000_000_000;
+pub(super) const STRAY_NS: i64 = 86_400_000_000_000;
 /// 1980-01-01 and 2200-01-01: a clock outside has failed.
 pub(super) const SANE_NS: Range<i64> = 315_532_800_000_000_000..7_258_118_400_000_000_000;
 

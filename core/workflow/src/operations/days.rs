@@ -14,6 +14,7 @@ use dragfree_engine::registry::Registry;
 use dragfree_engine::run::{Progress, RunOptions, run};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// A day is whole when no more than this is missing at either end of it, ns.
@@ -125,12 +126,13 @@ impl<'a> Planner<'a> {
 
     /// Telemetry that a day is made of: files that cover a part of it, and of the run-in before it.
     fn files<'f>(&self, inbox: &'f Inbox, day: NaiveDate) -> Vec<&'f InboxFile> {
-        let start = start_ns(day);
-        let covers = |from: i64, until: i64| move |file: &&InboxFile| file.first_ns < until && from <= file.last_ns;
-        if !inbox.files.iter().any(|file| covers(start, start + DAY_NS)(&file)) {
+        let of_day = day_ns(day);
+        let with_run_in = of_day.start - self.operations.run_in_ns..of_day.end;
+        let has = |file: &InboxFile, time: &Range<i64>| file.within(time.clone()).next().is_some();
+        if !inbox.files.iter().any(|file| has(file, &of_day)) {
             return Vec::new();
         }
-        inbox.files.iter().filter(covers(start - self.operations.run_in_ns, start + DAY_NS)).collect()
+        inbox.files.iter().filter(|file| has(file, &with_run_in)).collect()
     }
 
     /// A day beside its newest product; none where there is no telemetry of it.
@@ -160,13 +162,14 @@ impl<'a> Planner<'a> {
         let tried_with = sha256(tried.join("\n"));
         let failed = archive.failed(&name, &self.spacecraft).map_err(again)?;
         let failed = failed.filter(|(_, with)| *with == tried_with).map(|(reason, _)| reason);
-        let (start, end) = (start_ns(day), start_ns(day) + DAY_NS);
-        let first = files.iter().map(|file| file.first_ns).min().unwrap_or(i64::MAX);
-        let last = files.iter().map(|file| file.last_ns).max().unwrap_or(i64::MIN);
+        let of_day = day_ns(day);
+        let covered = || files.iter().flat_map(|file| file.within(of_day.clone()));
+        let begins = covered().any(|stretch| stretch.start <= of_day.start + EDGE_NS);
+        let ends = covered().any(|stretch| of_day.end - EDGE_NS < stretch.end);
         Ok(Some(Planned {
             day: Day { day, product: row.map(|row| row.id), reasons, failed },
             files: files.into_iter().map(|file| file.path.clone()).collect(),
-            whole: first <= start + EDGE_NS && end - EDGE_NS <= last,
+            whole: begins && ends,
             stream: if same_configuration { Stream::Oper } else { Stream::Rpro },
             tried_with,
         }))
@@ -196,9 +199,9 @@ impl<'a> Planner<'a> {
                 reasons.push(format!("plugin {name} is another build"));
             }
         }
-        let start = row.day.parse().map_or(0, start_ns);
+        let of_day = row.day.parse().map_or(0..DAY_NS, day_ns);
         let asked = (row.asked_from_ns, row.asked_until_ns, row.run_in_ns);
-        if asked != (Some(start), Some(start + DAY_NS), self.operations.run_in_ns) {
+        if asked != (Some(of_day.start), Some(of_day.end), self.operations.run_in_ns) {
             reasons.push("another window or another run-in was asked for".to_owned());
         }
         reasons
@@ -261,18 +264,19 @@ impl<'a> Planner<'a> {
     }
 
     fn of(&self, planned: &Planned) -> RunOptions {
-        let start = start_ns(planned.day.day);
+        let of_day = day_ns(planned.day.day);
         RunOptions {
             files: planned.files.clone(),
-            from_ns: Some(start),
-            until_ns: Some(start + DAY_NS),
+            from_ns: Some(of_day.start),
+            until_ns: Some(of_day.end),
             stream: planned.stream,
             status: if planned.whole { Status::Final } else { Status::Quicklook },
             ..self.options.clone()
         }
     }
 
-    /// Runs a day. A day that gives no product is noted in the archive, so that the next one goes on.
+    /// Runs a day. A day that gives no product is noted in the archive, so that the next one goes on; where another
+    /// attempt may succeed it is not, so that the next program runs the day again.
     ///
     /// # Errors
     /// The archive cannot be written, or somebody asked to stop.
@@ -283,6 +287,9 @@ impl<'a> Planner<'a> {
             Err(stopped @ (EngineError::Stopped | EngineError::Archive(_))) => Err(stopped.into()),
             Err(error) => {
                 let reason = error.to_string();
+                if error.may_pass() {
+                    return Ok(Ran { day, outcome: Outcome::Failed(reason) });
+                }
                 let stamp = Stamp { time: self.options.created, software: &self.options.software };
                 let keep = || {
                     let mut archive = Archive::create(&self.operations.archive)?;
@@ -305,8 +312,7 @@ pub type Report = Box<dyn FnMut(Progress)>;
 pub fn plan(planner: &Planner<'_>, archive: &Archive, inbox: &Inbox) -> Result<Vec<Planned>, WorkflowError> {
     let mut days = BTreeSet::new();
     for file in &inbox.files {
-        let (first, last) = (file.first_ns.div_euclid(DAY_NS), file.last_ns.div_euclid(DAY_NS));
-        days.extend((first..=last).map(day_of_number));
+        days.extend(file.days().flatten().map(day_of_number));
     }
     let mut planned = Vec::new();
     for day in days {
@@ -341,7 +347,8 @@ pub fn catch_up(
     Ok(ran)
 }
 
-/// First instant of a day, Unix ns.
-fn start_ns(day: NaiveDate) -> i64 {
-    start_of_day_ns(day_number(day))
+/// The time of a day, Unix ns.
+fn day_ns(day: NaiveDate) -> Range<i64> {
+    let start = start_of_day_ns(day_number(day));
+    start..start + DAY_NS
 }
