@@ -4,7 +4,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
-use crate::design::{Choices, model};
+use crate::design::{self, Choices, model};
 use crate::filter::{Adaptation, Settings};
 use crate::model::{Coefficient as Theta, Prior};
 use crate::octaves::Octaves;
@@ -209,6 +209,14 @@ impl Stage for EsAkf {
                 c.name, c.initial
             )
         }));
+        let left_out = design::without_their_colour(&self.mission.noise);
+        if !left_out.is_empty() {
+            self.notes.push(format!(
+                "es-akf: {} counts as white here, by its level above its corner, so that the filter's σ may be too small; the \
+                 batch solution measures the noise at low frequencies",
+                left_out.join(", ")
+            ));
+        }
         let mut groups: Vec<Vec<TestMass>> = there.iter().map(|test_mass| vec![test_mass.clone()]).collect();
         if together && there.len() > 1 {
             match self.link_filter(&there, table, available, link)? {

@@ -148,6 +148,27 @@ pub fn model(
     })
 }
 
+/// Tables of `[noise]` with a coloured part that the filter leaves out: it has that of readouts, and of forces on a test
+/// mass the part whose PSD falls as 1/f².
+pub fn without_their_colour(noise: &Noise) -> Vec<&'static str> {
+    let coloured = |shape: Option<NoiseShape>, known: Option<u32>| {
+        shape.is_some_and(|shape| shape.coloured().any(|term| Some(term.exponent) != known))
+    };
+    let force = noise.thruster_force.as_ref().map(|n| n.shape());
+    let torque = noise.thruster_torque.as_ref().map(|n| n.shape());
+    let sunlight = noise.solar_pressure.as_ref().map(|n| n.shape());
+    let electrodes = noise.electrostatic_force.as_ref().map(|n| n.shape());
+    let stray = noise.test_mass_acceleration.as_ref().map(|n| n.shape());
+    let all = [
+        ("thruster_force", coloured(force, None)),
+        ("thruster_torque", coloured(torque, None)),
+        ("solar_pressure", coloured(sunlight, None)),
+        ("electrostatic_force", coloured(electrodes, Some(2))),
+        ("test_mass_acceleration", coloured(stray, Some(2))),
+    ];
+    all.into_iter().filter(|(_, left_out)| *left_out).map(|(name, _)| name).collect()
+}
+
 fn readout_noise(noise: &Noise, name: &str) -> Result<NoiseShape, MissionError> {
     let table = noise.displacement(name).map(DisplacementNoise::shape);
     table.ok_or_else(|| MissionError::Missing { section: format!("noise.{name}"), needed_by: STAGE })
@@ -396,6 +417,22 @@ mod tests {
         let model = of(&["ifo_x", "ifo_y", "is_z"]);
         assert_eq!(model.readout_m2[1], model.readout_m2[0]);
         assert!(of(&["ifo_x", "is_y", "is_z"]).readout_m2[1] > model.readout_m2[1]);
+    }
+
+    #[test]
+    fn colour_that_the_filter_has_not_is_named() {
+        let mut mission = taiji();
+        assert_eq!(without_their_colour(&mission.noise), [""; 0]);
+        let force = mission.noise.thruster_force.as_mut().expect("a force");
+        (force.corner_hz, force.exponent) = (1e-2, 2);
+        let stray = |exponent: u32| {
+            let table = serde_json::json!({ "asd_m_s2_rthz": 3e-15, "corner_hz": 1e-3, "exponent": exponent });
+            serde_json::from_value(table).expect("stray forces")
+        };
+        mission.noise.test_mass_acceleration = Some(stray(2));
+        assert_eq!(without_their_colour(&mission.noise), ["thruster_force"]);
+        mission.noise.test_mass_acceleration = Some(stray(4));
+        assert_eq!(without_their_colour(&mission.noise), ["thruster_force", "test_mass_acceleration"]);
     }
 
     #[test]

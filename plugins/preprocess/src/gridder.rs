@@ -374,7 +374,11 @@ impl Gridder {
                 self.summary.longest_cut_ns = gap_ns;
                 self.summary.longest_cut_from_ns = self.last_reference_ns;
             }
-            self.rows += self.blank_rows_before_cut();
+            // The phase may be another: epochs must advance by half an interval at least.
+            let latest_ns = time + phase - rate.part_ns(0.5);
+            let blank = self.blank_rows_before_cut();
+            let before = |count: &i64| self.epochs.time_ns(self.rows + count - 1) <= latest_ns;
+            self.rows += (1..=blank).rev().find(before).unwrap_or(1);
         }
         self.epochs.begin(self.rows, time + phase);
         self.last_reference_ns = time;

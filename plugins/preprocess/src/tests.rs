@@ -254,6 +254,20 @@ fn long_gaps_are_emitted_in_bounded_pieces_or_omitted() {
     assert_accounted(&gridder);
 }
 
+/// A gap hardly longer than the longest that is filled, after which the clock has another phase.
+#[test]
+fn epochs_advance_where_a_gap_is_cut_and_the_phase_changes() {
+    for (first, phase_ns) in [8_009, 8_010].into_iter().flat_map(|k| [-45, -10, 10, 49].map(|ms| (k, ms * 1_000_000))) {
+        let times = (0..8_000).map(|k| START + k * DT).chain((first..16_000).map(|k| START + k * DT + phase_ns));
+        let tables = vec![telemetry("is", &IS, times.clone(), 1), telemetry("dws", &DWS, times, 2)];
+        let (grid, gridder) = run_with(&tables, &Config { max_gap_s: 1.0, ..config() }, 700, |_| false);
+        let least = grid.times.windows(2).map(|two| two[1] - two[0]).min();
+        assert!(least >= Some(DT / 2), "{first}, {phase_ns}: {least:?}");
+        let gap_ns = (first - 7_999) * DT + phase_ns;
+        assert_eq!(gridder.summary.cut_gaps, u64::from(gap_ns > 1_000_000_000), "{first}, {phase_ns}");
+    }
+}
+
 /// Sorts times, as a method of iterators.
 trait Sorted: Iterator<Item = i64> + Sized {
     fn sorted(self) -> std::vec::IntoIter<i64> {
