@@ -3,6 +3,7 @@
 
 use crate::ArchiveError;
 use crate::archive::Archive;
+use crate::catalogue::{Place, Row};
 use crate::files::{IoContext as _, sha256, write_durable};
 use crate::journal::{Event, InputPlace, Stamp, Stored};
 use crate::product::{self, EXTRACT, PRODUCT, Product, Supersedes};
@@ -12,12 +13,35 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-/// What is about to be placed.
-struct Prepared {
-    /// Digest and staged file of each content.
-    contents: BTreeMap<String, PathBuf>,
-    events: Vec<Event>,
+/// A product of another archive, with what an event says of it.
+struct Found {
+    product: Product,
+    made_of: BTreeMap<String, Stored>,
+    places: Vec<InputPlace>,
+    row: Row,
 }
+
+impl Found {
+    fn read(folder: &Path, id: &str) -> Result<Self, ArchiveError> {
+        let from = Archive::open(folder)?;
+        let kept = |place: Place| (place.role, Stored { name: place.name, sha256: place.sha256, size: place.size });
+        let seen = |place: Place| Some(InputPlace { sha256: place.sha256, path: place.path? });
+        Ok(Self {
+            product: from.product(id)?,
+            made_of: from.all_made_of(id)?.into_iter().map(kept).collect(),
+            places: from.inputs(id)?.into_iter().filter_map(seen).collect(),
+            row: from.row(id)?,
+        })
+    }
+
+    /// Digest of what was found and from what.
+    fn digest(&self) -> &str {
+        &self.product.header.non_standard_attributes.sha256
+    }
+}
+
+/// What is about to be placed: digest and staged file of each content.
+type Contents = BTreeMap<String, PathBuf>;
 
 impl Archive {
     /// Takes over products, each from an archive in a folder, with all their files: all of them or none, as the next
@@ -32,39 +56,61 @@ impl Archive {
         stamp: &Stamp<'_>,
     ) -> Result<Vec<String>, ArchiveError> {
         let staging = Staging::begin(&self.folder)?;
+        let mut contents = Contents::new();
+        let mut all = Vec::new();
+        // Before the archive is held: others wait for it, and the copies of many days take long.
+        for (folder, id) in products {
+            let found = Found::read(folder, id)?;
+            let (_, newest) = self.newest_revision(found.row.stem())?;
+            if !newest.is_some_and(|newest| digest(&newest) == found.digest()) {
+                copy(staging.path(), folder, id, &mut contents)?;
+            }
+            all.push((folder, id, found));
+        }
         let _held = self.hold()?;
         self.finish()?;
         let mut newest: BTreeMap<String, (u32, Option<Product>)> = BTreeMap::new();
-        let mut prepared = Prepared { contents: BTreeMap::new(), events: Vec::new() };
-        let mut ids = Vec::new();
-        for (folder, id) in products {
-            let from = Self::open(folder)?;
-            let product = from.product(id)?;
-            let stem = crate::catalogue::stem(id).to_owned();
+        let (mut ids, mut events) = (Vec::new(), Vec::new());
+        for (folder, id, found) in all {
+            let stem = found.row.stem().to_owned();
             let (revision, before) = match newest.remove(&stem) {
                 Some(known) => known,
                 None => self.newest_revision(&stem)?,
             };
-            let digest = |product: &Product| product.header.non_standard_attributes.sha256.clone();
-            if before.as_ref().is_some_and(|before| digest(before) == digest(&product)) {
+            if before.as_ref().is_some_and(|before| digest(before) == found.digest()) {
                 newest.insert(stem, (revision, before));
                 continue;
             }
             if revision == LAST_REVISION {
                 return Err(ArchiveError::Full(stem));
             }
-            let apart = product.unnumbered(&stem);
+            // What somebody has added meanwhile may have left something to copy.
+            copy(staging.path(), folder, id, &mut contents)?;
+            let apart = found.product.unnumbered(&stem);
             let supersedes = before.map(|before| Supersedes::new(&before, &apart));
-            let product = apart.numbered(revision + 1, product.attachments.clone(), supersedes);
+            let product = apart.numbered(revision + 1, found.product.attachments.clone(), supersedes);
+            let text = product.emit()?;
+            let document = sha256(&text);
+            let staged = staging.path().join(&document);
+            write_durable(&staged, text.as_bytes())?;
+            contents.insert(document.clone(), staged);
             ids.push(product.id().to_owned());
-            prepared.product(staging.path(), (&from, id), &product)?;
+            events.push(Event::Product {
+                id: product.id().to_owned(),
+                sha256: document,
+                made_of: found.made_of,
+                places: found.places,
+                from_ns: found.row.asked_from_ns,
+                until_ns: found.row.asked_until_ns,
+                run_in_ns: found.row.run_in_ns,
+            });
             newest.insert(stem, (revision + 1, Some(product)));
         }
         if ids.is_empty() {
             return Ok(ids);
         }
-        let contents: Vec<_> = prepared.contents.into_iter().map(|(sha256, path)| (path, sha256)).collect();
-        self.place_and_commit(&staging, &contents, Event::Several { events: prepared.events }, stamp)?;
+        let contents: Vec<_> = contents.into_iter().map(|(sha256, path)| (path, sha256)).collect();
+        self.place_and_commit(&staging, &contents, Event::Several { events }, stamp)?;
         Ok(ids)
     }
 
@@ -77,48 +123,24 @@ impl Archive {
     }
 }
 
-impl Prepared {
-    /// Stages the files of a product and what it was made of, and its document under its new name.
-    fn product(&mut self, staging: &Path, (from, id): (&Archive, &str), product: &Product) -> Result<(), ArchiveError> {
-        let row = from.row(id)?;
-        // The document has another name here; an extract is no part of a product.
-        let beside = |suffix: &str| ![PRODUCT, EXTRACT].contains(&suffix);
-        for (_, sha256, _) in from.files_of(id)?.into_iter().filter(|(suffix, ..)| beside(suffix)) {
-            self.stage(staging, from, &sha256)?;
-        }
-        let mut made_of = BTreeMap::new();
-        for place in from.all_made_of(id)? {
-            self.stage(staging, from, &place.sha256)?;
-            let kept = Stored { name: place.name, sha256: place.sha256, size: place.size };
-            made_of.insert(place.role, kept);
-        }
-        let text = product.emit()?;
-        let document = sha256(&text);
-        let staged = staging.join(&document);
-        write_durable(&staged, text.as_bytes())?;
-        self.contents.insert(document.clone(), staged);
-        let places = from.inputs(id)?.into_iter().filter_map(|place| {
-            let (path, sha256) = (place.path?, place.sha256);
-            Some(InputPlace { sha256, path })
-        });
-        self.events.push(Event::Product {
-            id: product.id().to_owned(),
-            sha256: document,
-            made_of,
-            places: places.collect(),
-            from_ns: row.asked_from_ns,
-            until_ns: row.asked_until_ns,
-            run_in_ns: row.run_in_ns,
-        });
-        Ok(())
-    }
+/// Digest of what a product found and from what.
+fn digest(product: &Product) -> &str {
+    &product.header.non_standard_attributes.sha256
+}
 
-    /// Copies a content into the staging folder: a link would let who writes over a result write over the archive.
-    fn stage(&mut self, staging: &Path, from: &Archive, digest: &str) -> Result<(), ArchiveError> {
-        if self.contents.contains_key(digest) {
-            return Ok(());
+/// Copies what is beside a product's document, and what it was made of, into the staging folder; what is there already
+/// stays. A link would let who writes over a result write over the archive.
+fn copy(staging: &Path, folder: &Path, id: &str, contents: &mut Contents) -> Result<(), ArchiveError> {
+    let from = Archive::open(folder)?;
+    // The document has another name here; an extract is no part of a product.
+    let beside = |suffix: &str| ![PRODUCT, EXTRACT].contains(&suffix);
+    let files = from.files_of(id)?.into_iter().filter(|(suffix, ..)| beside(suffix)).map(|(_, sha256, _)| sha256);
+    let made_of = from.all_made_of(id)?.into_iter().map(|place| place.sha256);
+    for digest in files.chain(made_of) {
+        if contents.contains_key(&digest) {
+            continue;
         }
-        let (source, staged) = (from.objects.path(digest), staging.join(digest));
+        let (source, staged) = (from.objects.path(&digest), staging.join(&digest));
         fs::copy(&source, &staged).at("copy", &source)?;
         File::open(&staged).and_then(|file| file.sync_all()).at("write", &staged)?;
         let found = crate::files::sha256_of(&staged).at("read", &staged)?;
@@ -126,7 +148,7 @@ impl Prepared {
             let reason = format!("its digest is {found}, its name says {digest}");
             return Err(ArchiveError::Damaged { path: source, reason });
         }
-        self.contents.insert(digest.to_owned(), staged);
-        Ok(())
+        contents.insert(digest, staged);
     }
+    Ok(())
 }

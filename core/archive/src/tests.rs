@@ -293,6 +293,33 @@ fn products_are_taken_over_whole_and_copied() {
     assert!(list(here.path()).problems.is_empty());
 }
 
+/// What takes long happens before the archive is held, as others wait for it.
+#[test]
+fn products_are_copied_before_the_archive_is_held() {
+    let (here, other) = (tempfile::tempdir().expect("folder"), tempfile::tempdir().expect("folder"));
+    let id = write(other.path(), &product(0, "SC1", 1.0)).product.id().to_owned();
+    let mut archive = Archive::create(here.path()).expect("an archive");
+    let held = archive.hold().expect("held");
+    let products = [(other.path().to_owned(), id)];
+    let copied = || {
+        let staging = names(&here.path().join("staging"));
+        staging.iter().filter(|name| !name.ends_with(".lock")).any(|name| {
+            let contents = names(&here.path().join("staging").join(name));
+            contents.iter().filter(|content| content.len() == 64).count() >= 3
+        })
+    };
+    std::thread::scope(|scope| {
+        let taken = scope.spawn(|| archive.take_over(&products, &stamp()).expect("taken over"));
+        let since = std::time::Instant::now();
+        while !copied() {
+            assert!(since.elapsed().as_secs() < 30, "nothing was copied while another held the archive");
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        drop(held);
+        assert_eq!(taken.join().expect("no panic"), [FIRST]);
+    });
+}
+
 /// Everything that the catalogue says is in journal and objects.
 #[test]
 fn a_catalogue_made_again_is_the_same() {

@@ -256,17 +256,17 @@ impl Basis {
         })
     }
 
-    /// Stretches of time of each product, any of which can be kept out of the fit; none of a product whose extract has
-    /// none.
+    /// Stretches of time of each product, any of which can be kept out of the fit; none where there are not two.
     pub fn stretches(&self, product: &str) -> Vec<Stretch> {
         let day = self.days.iter().find(|day| day.product == product);
         let all = day.map_or(&[][..], |day| &day.stretches);
+        let all = if all.len() > 1 { all } else { &[] };
         let stretch =
             |(k, &(from_ns, until_ns))| Stretch { name: format!("{product}{STRETCH}{}", k + 1), from_ns, until_ns };
         all.iter().enumerate().map(stretch).collect()
     }
 
-    /// The products of which a part is kept out. A product of which every stretch is kept out is kept out itself.
+    /// The products of which a part is kept out.
     fn divided(&self, held_out: &[String]) -> Result<Vec<Arc<Divided>>, RefitError> {
         let mut parts: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
         for held in held_out {
@@ -277,7 +277,7 @@ impl Basis {
             let count = day.stretches.len();
             let number = stretch.parse::<usize>().ok().filter(|k| (1..=count).contains(k));
             let number = number.ok_or_else(|| RefitError::NoStretch(held.clone()))?;
-            if count > 1 && held_out.iter().all(|other| other != product) {
+            if held_out.iter().all(|other| other != product) {
                 parts.entry(product).or_default().insert(number - 1);
             }
         }

@@ -112,6 +112,18 @@ fn squares(day: &Data, columns: &[usize], values: &DVector<f64>) -> f64 {
     (&day.measured - day.regressors.select_columns(columns) * values).norm_squared()
 }
 
+/// Of a product with one stretch nothing would be left: it was fitted nevertheless.
+#[test]
+fn the_only_stretch_of_a_product_is_not_kept_out_alone() {
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(4);
+    let days = [data(&mut random, &DVector::zeros(OFFSETS + 1)), data(&mut random, &DVector::zeros(OFFSETS + 1))];
+    let mut basis = basis(&days);
+    basis.days[0].stretches = vec![(0, 1)];
+    assert!(basis.stretches("day0").is_empty(), "it is not offered");
+    let refused = basis.refit(&asked(&[], &[&format!("day0{STRETCH}1")]));
+    assert!(matches!(refused, Err(RefitError::WholeProduct(product)) if product == "day0"));
+}
+
 /// Every rung is the least-squares solution of its columns, made from the data themselves by QR: values, σ, χ² of the
 /// fit and of the day that is kept out.
 #[test]
