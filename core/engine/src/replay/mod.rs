@@ -134,7 +134,7 @@ type Stretch = Result<(Option<Chunk>, Findings), ReplayError>;
 
 impl Replay {
     /// Opens `files` for the log times within `window_ns` (Unix ns, all when `None`); with two or more `threads` the
-    /// reading goes ahead on a thread of its own. Files are put in order of their first time, then of their path.
+    /// reading goes ahead on a thread of its own. Files are put in order of their first time, then of their name.
     ///
     /// # Errors
     /// [`ReplayError`] when a file cannot be read at all or does not fit the others or the interface.
@@ -175,7 +175,8 @@ impl Replay {
             }
         }
         let mut files = scans;
-        files.sort_by_cached_key(|(input, scan)| (first_time(scan), input.path().to_owned()));
+        // By name before path, as of conflicting messages those of the first file count, wherever the files lie.
+        files.sort_by_cached_key(|(input, scan)| (first_time(scan), name_of(input.path()), input.path().to_owned()));
         let mut info = info(&files, &mut losses)?;
         for (input, scan) in &files {
             let covered = covered::covered(input, &scan.pieces);

@@ -281,6 +281,23 @@ fn of_conflicting_values_the_first_file_counts() {
     assert!(outcome.losses.data_loss(), "the other values were there and are not in the tables");
 }
 
+/// Two files that begin at once, in folders of either order: a day made again elsewhere must come out the same.
+#[test]
+fn of_conflicting_values_those_of_the_same_file_count_wherever_it_lies() {
+    let of = |value: f64| Foreign::new(vec![("/dws", DAY, dws(value, 0))]).bytes();
+    let folder = tempfile::tempdir().unwrap();
+    for (a, b) in [("1", "2"), ("2", "1")] {
+        let paths = [(a, "a.mcap", 1.0), (b, "b.mcap", 2.0)].map(|(under, name, value)| {
+            let path = folder.path().join(under).join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, of(value)).unwrap();
+            path
+        });
+        let (outcome, _) = drive_files(&paths, None, 1).unwrap();
+        assert_eq!(outcome.values("dws", "tm1.theta_orf_rad"), [1.0], "a.mcap in folder {a}");
+    }
+}
+
 /// Late by 0.3 s for a minute: three epochs without a message, and three with two.
 #[test]
 fn a_clock_that_is_wrong_for_a_while_is_told_and_a_loss() {
