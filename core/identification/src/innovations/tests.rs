@@ -788,6 +788,35 @@ fn the_separation_of_two_is_what_one_leaves_of_the_other() {
     }
 }
 
+/// Data in two stretches with a constant, a cause and another that looks a little like it: what the other leaves of
+/// the cause by least squares over both, as a sum of squares in each stretch.
+#[test]
+fn a_contrast_is_the_part_of_a_stretch_in_the_separation() {
+    let rows = 40;
+    let cause = |t: usize| (0.7 * t as f64).sin();
+    let other = |t: usize| 0.5 * cause(t) + (0.3 * t as f64).cos() * if t < rows / 2 { 1.0 } else { 3.0 };
+    let design = DMatrix::from_fn(rows, 3, |t, k| 100.0 * [1.0, cause(t), other(t)][k]);
+    let stretch = |from: usize| design.rows(from, rows / 2).into_owned();
+    let stretches = [stretch(0), stretch(rows / 2)];
+    let informations = stretches.each_ref().map(|rows| rows.tr_mul(rows));
+    let truth = [3.0, 0.2, 0.0];
+    let own = quadratic(&informations[0] + &informations[1], &truth, vec![candidate(1), candidate(2)]);
+
+    let acts = design.column(1) * truth[1];
+    let rivals = design.select_columns(&[0, 2]);
+    let fitted = rivals.clone().svd(true, true).solve(&acts, 1e-12).expect("two columns");
+    let left = acts - rivals * fitted;
+    let weights = own.contrast(0, 1, &[0]);
+    let mut sum = 0.0;
+    for (k, information) in informations.iter().enumerate() {
+        let expected = left.rows(k * rows / 2, rows / 2).norm_squared();
+        let part = weights.dot(&(information * &weights));
+        assert!((part / expected - 1.0).abs() < 1e-6, "stretch {k}: {part} for {expected}");
+        sum += part;
+    }
+    assert!((sum / own.separation(0, 1, &[0]) - 1.0).abs() < 1e-6);
+}
+
 /// Outside of its range a value explains only what its best value inside explains, and data that want a value far
 /// outside name nothing; equals share the probability.
 #[test]
