@@ -11,6 +11,7 @@
 #include <stdio.h>
 #include <sys/resource.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -88,8 +89,26 @@ static void misbehave(const char *phase) {
   }
 }
 
+static volatile int escaped;
+
+static void escape(int signal) {
+  (void)signal;
+  if (open("escaped", O_WRONLY | O_CREAT, 0600) >= 0) escaped = 1;
+}
+
+/* Whether a thread that was there before the plugin may do what the plugin may not. */
+static int other_threads_reach(void) {
+  struct sigaction action = {.sa_handler = escape};
+  sigaction(SIGUSR1, &action, NULL);
+  for (pid_t thread = getpid(); thread < getpid() + 4096; thread++) syscall(SYS_tgkill, getpid(), thread, SIGUSR1);
+  usleep(200000);
+  return escaped;
+}
+
 /* Whether it reaches what a plugin that is not trusted must not reach. */
 static int reaches(void) {
+  if (is("process_reaches_by_a_thread")) return other_threads_reach();
+  if (is("process_touches")) return utimensat(AT_FDCWD, ".", NULL, 0) == 0 || chmod(".", 0700) == 0;
   if (is("process_reads")) return open("/etc/passwd", O_RDONLY) >= 0;
   if (is("process_lists")) return open("/", O_RDONLY | O_DIRECTORY) >= 0;
   if (is("process_writes")) return open("escaped", O_WRONLY | O_CREAT, 0600) >= 0;

@@ -208,7 +208,7 @@ fn of_single_calls() -> Vec<Case> {
 }
 
 /// What a plugin that is not trusted must not reach.
-const REACHES: [&str; 10] = [
+const REACHES: [&str; 12] = [
     "process_reads",
     "process_lists",
     "process_writes",
@@ -219,6 +219,8 @@ const REACHES: [&str; 10] = [
     "process_takes_memory",
     "process_raises_limits",
     "process_forks",
+    "process_reaches_by_a_thread",
+    "process_touches",
 ];
 
 /// Where the plugin runs.

@@ -145,6 +145,11 @@ pub(crate) enum Command {
 }
 
 impl Command {
+    /// Whether another process of this program has started it to run a plugin apart.
+    pub(crate) fn is_a_plugins_process(&self) -> bool {
+        matches!(self, Self::Plugins(Plugins::Serve))
+    }
+
     /// Whether it carries rows of telemetry through plugins, and so can end between two batches of them.
     pub(crate) fn carries_rows(&self) -> bool {
         matches!(

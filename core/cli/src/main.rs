@@ -46,7 +46,10 @@ fn perform(mut arguments: Arguments) -> ExitCode {
     if let Err(error) = output::reserve() {
         return complain(&error);
     }
-    watchdog::start(Duration::from_secs_f64(arguments.global.plugin_time_limit));
+    // The process of a plugin has no thread before it is limited in what it may do; the one that asked it looks.
+    if !arguments.command.is_a_plugins_process() {
+        watchdog::start(Duration::from_secs_f64(arguments.global.plugin_time_limit));
+    }
     let mut run = || -> Result<u8, failure::Failure> {
         installed::resolve(&mut arguments)?;
         if arguments.command.carries_rows() {

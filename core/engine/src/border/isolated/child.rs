@@ -33,10 +33,11 @@ const FAREWELL: Duration = Duration::from_secs(5);
 pub fn serve() -> ! {
     let code = match greeted() {
         Ok((socket, memories)) => {
-            let ended = watch(&socket).and_then(|()| {
+            let serve = || {
                 let forward = Forward { socket: socket.try_clone()?, spans: AtomicU64::new(1) };
                 tracing::subscriber::with_default(Arc::new(forward), || Served::open(socket, memories)?.serve())
-            });
+            };
+            let ended = serve();
             u8::from(ended.is_err_and(|e| e.kind() != io::ErrorKind::UnexpectedEof))
         }
         Err(_) => 1,
@@ -93,7 +94,7 @@ impl Served {
         let (Ask::Open { path, sha256, files }, _) = receive(&mut socket, 0)? else {
             return Err(io::Error::other("the first message opens nothing"));
         };
-        let opened = open(&path, &sha256, &files);
+        let opened = open(&socket, &path, &sha256, &files);
         let (library, lacking) = match opened {
             Ok(opened) => opened,
             Err(error) => {
@@ -193,7 +194,12 @@ impl Served {
     }
 }
 
-fn open(path: &Path, sha256: &str, files: &[PathBuf]) -> Result<(Library, Vec<String>), BorderError> {
+fn open(
+    socket: &UnixStream,
+    path: &Path,
+    sha256: &str,
+    files: &[PathBuf],
+) -> Result<(Library, Vec<String>), BorderError> {
     let refused = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
     let checked = Checked::new(path, None)?;
     if checked.sha256() != sha256 {
@@ -201,6 +207,8 @@ fn open(path: &Path, sha256: &str, files: &[PathBuf]) -> Result<(Library, Vec<St
     }
     let lacking = sandbox::enter(path, files)
         .map_err(|error| refused(format!("its process cannot be limited in what it may do: {error}")))?;
+    // Not before: the sandbox is that of a thread and of those that it starts.
+    watch(socket).map_err(|error| refused(format!("nobody would see that its parent has ended: {error}")))?;
     Ok((Library::load(checked)?, lacking))
 }
 

@@ -56,13 +56,39 @@ const DENIED: &[c_long] = &[
     libc::SYS_mq_open,
     libc::SYS_open_by_handle_at,
     libc::SYS_setrlimit,
+    // Landlock does not look at these.
+    libc::SYS_fchmod,
+    libc::SYS_fchmodat,
+    libc::SYS_fchmodat2,
+    libc::SYS_fchown,
+    libc::SYS_fchownat,
+    libc::SYS_utimensat,
+    libc::SYS_setxattr,
+    libc::SYS_lsetxattr,
+    libc::SYS_fsetxattr,
+    libc::SYS_removexattr,
+    libc::SYS_lremovexattr,
+    libc::SYS_fremovexattr,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_chmod,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_chown,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_lchown,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_utime,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_utimes,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_futimesat,
     #[cfg(target_arch = "x86_64")]
     libc::SYS_fork,
     #[cfg(target_arch = "x86_64")]
     libc::SYS_vfork,
 ];
 
-/// Puts the calling thread, and all that it starts, behind the sandbox. What this kernel does not have of it is told.
+/// Puts the calling thread, and all that it starts, behind the sandbox: the process must have no other. What this kernel
+/// does not have of it is told.
 ///
 /// # Errors
 /// A limit cannot be set.
@@ -73,6 +99,10 @@ pub(super) fn enter(library: &Path, files: &[PathBuf]) -> std::io::Result<Vec<St
         setrlimit(resource, Rlimit { current: Some(limit), maximum: Some(limit) })?;
     }
     let mut lacking = Vec::new();
+    // A plugin can run in any thread of its process, by a signal.
+    if std::fs::read_dir("/proc/self/task").map_or(0, Iterator::count) != 1 {
+        lacking.push("a process with one thread (its others may do what they like)".to_owned());
+    }
     match restrict_files(library, files) {
         Ok(RulesetStatus::FullyEnforced) => {}
         Ok(RulesetStatus::PartiallyEnforced) => lacking.push("a part of Landlock".to_owned()),
