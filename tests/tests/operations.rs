@@ -262,6 +262,18 @@ fn a_command_of_the_operators_is_run_for_a_loss_of_data() {
     let dry = json(dragfree(mission.path()).args(["catch-up", "--dry-run", "--json"]), 0);
     let due: Vec<&Value> = dry["days"].as_array().expect("days").iter().map(|day| &day["day"]).collect();
     assert_eq!(due, ["2035-01-03"]);
+    // One that fails stops no other day, nor the commands of others.
+    let failing = "on_data_loss = \"echo $DRAGFREE_DAY >> all; false\"\n";
+    std::fs::write(&ops, text.replace("run_in_hours", &format!("{failing}run_in_hours"))).expect("writable");
+    for day in [3, 4] {
+        let bytes = std::fs::read(mission.vault(day)).expect("readable");
+        std::fs::write(mission.inbox(&format!("cut{day}.mcap")), &bytes[..bytes.len() / 2]).expect("written");
+    }
+    let told = json(&mut mission.catch_up(), 1);
+    let failed = |day: usize| told["days"][day]["commands_failed"][0].as_str().unwrap_or_default().to_owned();
+    assert!(failed(0).contains("exit status: 1") && failed(1).contains("exit status: 1"), "{told:#}");
+    let all = std::fs::read_to_string(mission.path().join("all")).expect("the command was run");
+    assert_eq!(all, "2035-01-03\n2035-01-04\n");
     // From elsewhere, the file of operations names the archive; beside --archive it would be a second answer.
     let elsewhere = tempfile::tempdir().expect("a temporary folder");
     let list = || {

@@ -56,7 +56,7 @@ pub(crate) struct Global {
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) threads: Option<u16>,
     /// Seconds after which a call of a plugin that has not come back ends the program
-    #[arg(long, global = true, value_name = "S", default_value_t = 600.0, value_parser = positive)]
+    #[arg(long, global = true, value_name = "S", default_value_t = 600.0, value_parser = seconds)]
     pub(crate) plugin_time_limit: f64,
 }
 
@@ -162,6 +162,7 @@ impl Command {
                 | Self::Day(_)
                 | Self::CatchUp(_)
                 | Self::Watch(_)
+                | Self::Serve(_)
                 | Self::Products(Products::Rebuild { .. })
         )
     }
@@ -490,7 +491,7 @@ pub(crate) struct CatchUp {
 #[derive(Debug, Args)]
 pub(crate) struct Watch {
     /// Wait until nothing has been written into the inbox for this long, s
-    #[arg(long, value_name = "S", value_parser = positive, default_value_t = 5.0)]
+    #[arg(long, value_name = "S", value_parser = seconds, default_value_t = 5.0)]
     pub(crate) settle_s: f64,
     #[command(flatten)]
     pub(crate) ops: Ops,
@@ -587,7 +588,7 @@ pub(crate) struct Validate {
     #[arg(long, value_name = "FILE")]
     pub(crate) file: Vec<PathBuf>,
     /// Seconds after which a check that is not done is stopped
-    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = positive)]
+    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = seconds)]
     pub(crate) time_limit: f64,
     /// One check, in this very process: what this command asks of its children
     #[arg(long, hide = true)]
@@ -1060,6 +1061,14 @@ fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if number > 0.0 && number.is_finite() => Ok(number),
         _ => Err("a number above zero is needed".to_owned()),
+    }
+}
+
+/// A time in seconds that a clock can count.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if (1e-3..=1e9).contains(&number) => Ok(number),
+        _ => Err("a number of seconds from 0.001 to 1e9 is needed".to_owned()),
     }
 }
 

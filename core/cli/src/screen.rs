@@ -96,9 +96,12 @@ fn verdict(product: &Product, paint: Paint) -> String {
             let (meaning, painted) = match word {
                 "agree" if many => ("what fits all days fits each", paint.good(word)),
                 "disagree" if many => ("the days are not all the same", paint.bad(word)),
+                "agree" if !product.result.is_compared() => {
+                    ("no test of the data fails; there is no recursive solution to compare with", paint.good(word))
+                }
                 "agree" => ("the recursive and the batch solution agree within their errors", paint.good(word)),
                 "weak" => ("the data leave directions open; do not use those alone", paint.doubtful(word)),
-                _ => ("the solutions differ by more than their errors allow; do not use", paint.bad(word)),
+                _ => ("solutions differ by more than their errors, or a test of the data fails", paint.bad(word)),
             };
             text::labelled("verdict", &format!("{word}: {meaning}")).replacen(word, &painted, 1)
         }

@@ -1,7 +1,8 @@
 //! A product as an operator reads it.
 
+use chrono::NaiveDate;
 use dragfree_archive::product::{Coefficient, Product};
-use dragfree_archive::{Archive, EXTRACT, Row};
+use dragfree_archive::{Archive, EXTRACT, JOINT, Row};
 use dragfree_workflow::provenance::lineage;
 use maud::{Markup, html};
 
@@ -20,8 +21,8 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
     let has_extract = archive.files_of(&row.id)?.iter().any(|(suffix, ..)| suffix == EXTRACT);
     let lineage = lineage(&archive, &row.id)?;
     // A diagnosis may name what both solutions are wrong by together.
-    let named = if has_extract { site.basis(&row.id)?.named().to_vec() } else { Vec::new() };
-    let (class, word, sentence) = advice(&row, &product, has_extract, &named);
+    let diagnosed = if has_extract { Diagnosed::of(site, &row.id) } else { Diagnosed::No };
+    let (class, word, sentence) = advice(&row, &product, &diagnosed);
     let attributes = &product.header.non_standard_attributes;
     let hours = (attributes.stop_time_epoch_ns - attributes.start_time_epoch_ns) as f64 / 3.6e12;
     let body = html! {
@@ -38,7 +39,7 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
         (coefficients(&product))
         (before(site, &archive, &row, &product, links)?)
         (quality(&product))
-        (next(site, &row, &product, has_extract, links)?)
+        (next(site, &row, &product, &diagnosed, links)?)
         h2 { "Where it comes from" }
         p { "Inputs on the left, the product, and what came of it on the right. Numbers are the starts of SHA-256 \
             digests." }
@@ -53,8 +54,28 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
 const NOT_DIAGNOSED: &str =
     "An effect that the model lacks may still move both alike: a diagnosis has not looked for one.";
 
+/// What the diagnosis of a product has found.
+enum Diagnosed {
+    No,
+    /// Its extract is damaged, or of another release.
+    Unreadable(String),
+    Yes {
+        named: Vec<String>,
+        unexplained: Vec<String>,
+    },
+}
+
+impl Diagnosed {
+    fn of(site: &Site, id: &str) -> Self {
+        match site.basis(id) {
+            Ok(basis) => Self::Yes { named: basis.named().to_vec(), unexplained: basis.unexplained().to_vec() },
+            Err(error) => Self::Unreadable(error.to_string()),
+        }
+    }
+}
+
 /// Whether to use the values: class, word, sentence.
-fn advice(row: &Row, product: &Product, diagnosed: bool, named: &[String]) -> (&'static str, &'static str, String) {
+fn advice(row: &Row, product: &Product, diagnosed: &Diagnosed) -> (&'static str, &'static str, String) {
     let verdict = row.verdict.as_deref();
     if let Some(reason) = &row.withdrawn {
         return ("bad", "Do not use it.", format!("It was withdrawn: {reason}"));
@@ -69,43 +90,54 @@ fn advice(row: &Row, product: &Product, diagnosed: bool, named: &[String]) -> (&
             format!("Its model was fixed at the values of {from}: it says how well these predict this day."),
         );
     }
+    if !product.result.adopted().iter().any(|c| c.value.is_finite() && c.sigma.is_finite()) {
+        let why = "It has no values: too few data came, or too many were lost. Losses and notes are below.";
+        return ("bad", "Do not use it.", why.to_owned());
+    }
     if verdict == Some("disagree") {
-        let why =
-            "The two independent solutions differ by more than their errors: something is missing from the model.";
+        let why = "Something speaks against the model: solutions differ by more than their errors, or a test of the data \
+                   fails. The notes say which.";
         return ("bad", "Do not use it.", why.to_owned());
     }
     if product.quality.inconsistent {
         let why = "The model contradicts the data: something is missing from it, or the noise is another one.";
         return ("bad", "Do not use it.", why.to_owned());
     }
-    if !named.is_empty() {
-        let what = named.join(", ");
-        return (
-            "bad",
-            "Do not use it yet.",
-            format!(
+    if let Diagnosed::Yes { named, unexplained } = diagnosed {
+        let not_yet = |why: String| ("bad", "Do not use it yet.", why);
+        if !named.is_empty() {
+            let what = named.join(", ");
+            return not_yet(format!(
                 "The diagnosis names an effect that the model lacks: {what}. It moves the offset; the page on missing \
-                    physics shows by how much."
-            ),
-        );
+                 physics shows by how much."
+            ));
+        }
+        if !unexplained.is_empty() {
+            let what = unexplained.join("; ");
+            return not_yet(format!("The diagnosis finds that the model does not explain the data: {what}."));
+        }
     }
+    let many = product.header.non_standard_attributes.product == JOINT;
+    let agreement = match () {
+        () if verdict != Some("agree") => "No two solutions were compared.",
+        () if many => "What fits all days fits each.",
+        () if product.result.is_compared() => "The recursive and the batch solution agree within their errors.",
+        () => "No test of the data speaks against the model; there is no recursive solution to compare with.",
+    };
     if product.quality.data_loss {
-        return (
-            "lost",
-            "Use it with care.",
-            "The solutions agree, but data were lost; the losses are below.".to_owned(),
-        );
+        return ("lost", "Use it with care.", format!("{agreement} But data were lost; the losses are below."));
     }
     if verdict == Some("weak") {
         let what = product.quality.weak_directions.join("; ");
         return ("weak", "Use it with care.", format!("The data do not determine everything: {what}"));
     }
-    let why = "The recursive and the batch solution agree within their errors, and what the model leaves is noise.";
-    (
-        "good",
-        "Use it.",
-        format!("{why} {}", if diagnosed { "A diagnosis found no effect missing." } else { NOT_DIAGNOSED }),
-    )
+    let diagnosis = match diagnosed {
+        Diagnosed::No => NOT_DIAGNOSED.to_owned(),
+        Diagnosed::Unreadable(why) => format!("{NOT_DIAGNOSED} One was made, and cannot be read: {why}."),
+        Diagnosed::Yes { .. } => "A diagnosis found no effect missing.".to_owned(),
+    };
+    let (class, word) = if verdict == Some("agree") { ("good", "Use it.") } else { ("weak", "Use it with care.") };
+    (class, word, format!("{agreement} {diagnosis}"))
 }
 
 fn coefficients(product: &Product) -> Markup {
@@ -212,7 +244,7 @@ fn quality(product: &Product) -> Markup {
     }
 }
 
-fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Links) -> Result<Markup, PagesError> {
+fn next(site: &Site, row: &Row, product: &Product, diagnosed: &Diagnosed, links: &Links) -> Result<Markup, PagesError> {
     let (id, flags) = (shell(&row.id), &site.setup.flags);
     Ok(html! {
         h2 { "What next" }
@@ -220,18 +252,24 @@ fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Li
             @if let Some(to) = links.of("compare", &row.id) {
                 li { a href=(to) { "See where the model fails" } ", channel by channel and band by band." }
             }
-            @if has_extract && let Some(to) = links.missing(&row.id) {
+            @if matches!(diagnosed, Diagnosed::Yes { .. }) && let Some(to) = links.missing(&row.id) {
                 li { a href=(to) { "See which effect is missing" } ": switch effects on and watch the offset move." }
             }
         }
-        @if !has_extract && product.model.fixed_from.is_none() {
-            p { "This product was not diagnosed yet. The diagnosis reads the telemetry once; after it effects can be \
-                switched on here:" }
+        @if !matches!(diagnosed, Diagnosed::Yes { .. }) && product.model.fixed_from.is_none() {
+            p { "There is no diagnosis of this product that can be read. The diagnosis reads the telemetry once; after it \
+                effects can be switched on here:" }
             (button(site, links, &Job::Diagnose { product: row.id.clone() }, "Diagnose"))
             @if !links.is_file() { div id="running" aria-live="polite" data-reload="" { (running(site)?) } }
         }
         p { "It holds for a time once it is certified:" }
-        (command(&format!("dragfree products certify {id} --from {}{flags}",
-            product.header.non_standard_attributes.day)))
+        (command(&format!("dragfree products certify {id} --into SET --from {} --until {}{flags}",
+            product.header.non_standard_attributes.day, day_after(&product.header.non_standard_attributes.day))))
     })
+}
+
+/// The day after one; itself where it is none.
+fn day_after(day: &str) -> String {
+    let next = day.parse::<NaiveDate>().ok().and_then(|day| day.succ_opt());
+    next.map_or_else(|| day.to_owned(), |day| day.to_string())
 }

@@ -11,6 +11,9 @@ use crate::layout::{Links, command, data, shell};
 use crate::site::Site;
 use crate::starting::button;
 
+/// Letters that a name may have.
+const LONGEST_NAME: usize = 40;
+
 /// What the form holds.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
@@ -33,6 +36,10 @@ pub struct Typed {
 
 impl Typed {
     fn asked(&self) -> Result<Asked, FormulaError> {
+        if self.name.trim().len() > LONGEST_NAME {
+            let what = format!("its name has more than {LONGEST_NAME} letters");
+            return Err(FormulaError { what, letter: None });
+        }
         let number = |text: &str| {
             let refuse =
                 || FormulaError { what: format!("the range needs two numbers, and `{text}` is none"), letter: None };

@@ -35,6 +35,11 @@ impl Guard {
     /// Whether a page may be read. On this machine the name in the request must be of this machine: a foreign page can
     /// let its own name point here, and would then read the answer.
     pub(crate) fn may_read(&self, headers: &HeaderMap) -> Result<(), Refusal> {
+        // A foreign page cannot read the answer, but can make this server work; a link in it may lead here.
+        let foreign = text(headers, "sec-fetch-site") == "cross-site";
+        if foreign && text(headers, "sec-fetch-mode") != "navigate" {
+            return Err(Refusal::ForeignPage);
+        }
         if self.loopback {
             let host = text(headers, header::HOST.as_str());
             let names = ["127.0.0.1", "localhost", "[::1]"].map(|name| format!("{name}:{}", self.port));
@@ -70,6 +75,7 @@ impl Guard {
 /// Why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Refusal {
+    ForeignPage,
     Host,
     NoToken,
     ReadOnly,
@@ -80,6 +86,7 @@ pub(crate) enum Refusal {
 impl Refusal {
     pub(crate) fn words(self) -> &'static str {
         match self {
+            Self::ForeignPage => "a page of another server may lead here, and may not ask anything",
             Self::Host => "this server answers to 127.0.0.1 and localhost alone",
             Self::NoToken => "the token is needed as the password; it was printed where the server was started",
             Self::ReadOnly => "this server only reads; start it with --model FILE --allow-changes to keep effects",
@@ -129,6 +136,19 @@ mod tests {
         }
         assert_eq!(decoded("QWxhZGRpbjpvcGVuIHNlc2FtZQ==").as_deref(), Some("Aladdin:open sesame"));
         assert_eq!(decoded("a b"), None);
+    }
+
+    #[test]
+    fn a_foreign_page_may_lead_here_and_no_more() {
+        let guard = Guard::new(80, true, false).expect("a token");
+        let of = |site: &str, mode: &str| {
+            let all = [("host", "127.0.0.1:80"), ("sec-fetch-site", site), ("sec-fetch-mode", mode)];
+            guard.may_read(&headers(&all))
+        };
+        assert_eq!(of("cross-site", "no-cors"), Err(Refusal::ForeignPage));
+        for (site, mode) in [("cross-site", "navigate"), ("same-origin", "cors"), ("none", "navigate")] {
+            assert_eq!(of(site, mode), Ok(()), "{site} {mode}");
+        }
     }
 
     #[test]

@@ -37,8 +37,8 @@ impl State {
             () if row.withdrawn.is_some() => Self::Withdrawn,
             () if row.problem.is_some() || verdict == Some("disagree") || row.inconsistent == Some(true) => Self::Bad,
             () if row.data_loss == Some(true) => Self::Lost,
-            () if verdict == Some("weak") => Self::Weak,
-            () => Self::Good,
+            () if verdict == Some("agree") => Self::Good,
+            () => Self::Weak,
         }
     }
 
@@ -67,8 +67,8 @@ impl State {
 
     fn words(self) -> &'static str {
         match self {
-            Self::Good => "the solutions agree",
-            Self::Weak => "the data determine the offset weakly",
+            Self::Good => "nothing speaks against the model",
+            Self::Weak => "the data determine the offset weakly, or nothing was compared",
             Self::Lost => "data were lost",
             Self::Bad => "the model contradicts the data",
             Self::Withdrawn => "withdrawn",
@@ -149,7 +149,7 @@ fn of_series(site: &Site, spacecraft: &str, name: &str, days: &Days<'_>) -> Mark
         .filter_map(|(day, rows)| Some((day, State::of(rows), shown(rows)?)))
         .filter(|(_, state, _)| bad(*state))
         .collect();
-    let quiet = site.setup.today.signed_duration_since(last).num_days();
+    let quiet = (site.setup.today)().signed_duration_since(last).num_days();
     html! {
         h2 { (spacecraft) " · " (name) }
         p {

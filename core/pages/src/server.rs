@@ -34,6 +34,8 @@ const WORKING: usize = 2;
 const CONNECTIONS: usize = 128;
 /// Bytes of a body: a change names switches and nothing else.
 const BODY: usize = 1 << 16;
+/// Time after which a connection ends, whatever it does: a browser opens another.
+const LONGEST_CONNECTION: Duration = Duration::from_secs(600);
 /// A request must have come by then.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -89,7 +91,8 @@ async fn accept(listener: TcpListener, router: &Router) {
     let connections = Arc::new(Semaphore::new(CONNECTIONS));
     let asked_to_end = dragfree_engine::stop::flag();
     while !asked_to_end.load(Ordering::Relaxed) {
-        let Ok(permit) = Arc::clone(&connections).acquire_owned().await else { return };
+        let permit = tokio::time::timeout(LOOKS_UP, Arc::clone(&connections).acquire_owned()).await;
+        let Ok(Ok(permit)) = permit else { continue };
         let Ok(accepted) = tokio::time::timeout(LOOKS_UP, listener.accept()).await else { continue };
         let Ok((stream, _)) = accepted else {
             // No descriptor is left: one will be when a connection has ended.
@@ -101,8 +104,8 @@ async fn accept(listener: TcpListener, router: &Router) {
         http.timer(TokioTimer::new()).header_read_timeout(PATIENCE).keep_alive(true);
         let connection = http.serve_connection(TokioIo::new(stream), service);
         tokio::spawn(async move {
-            // A reader that breaks off is no error of the server's.
-            let _ = connection.await;
+            // A reader that breaks off is no error of the server's; one that does not read gives its place up.
+            let _ = tokio::time::timeout(LONGEST_CONNECTION, connection).await;
             drop(permit);
         });
     }

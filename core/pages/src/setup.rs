@@ -33,6 +33,6 @@ pub struct Setup {
     pub flags: String,
     /// Name and version of the program.
     pub software: &'static str,
-    /// Today, UTC.
-    pub today: NaiveDate,
+    /// Tells which day it is, UTC: a server stays for weeks.
+    pub today: Box<dyn Fn() -> NaiveDate + Send + Sync>,
 }

@@ -77,7 +77,7 @@ fn site(archive: &Path) -> Site {
         steps: Vec::new(),
         flags: String::new(),
         software: "dragfree 0.1.0",
-        today: "2035-01-01".parse().expect("a day"),
+        today: Box::new(|| "2035-01-01".parse().expect("a day")),
     })
 }
 
@@ -153,6 +153,64 @@ fn what_a_new_diagnosis_keeps_is_shown() {
             let offset = &refit.rungs[0].offsets[0];
             assert!((offset.value_m - value_m).abs() < 1e-12 && (offset.sigma_m - 0.5).abs() < 1e-12, "{offset:?}");
         }
+    }
+}
+
+/// The sentence of a day says what its product and its diagnosis say, and nothing else.
+#[test]
+fn a_day_is_of_use_where_nothing_speaks_against_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let of = |day: i64, change: fn(&mut serde_json::Value)| {
+        let mut document = serde_json::to_value(product(day, "1")).expect("JSON");
+        change(&mut document);
+        write(folder.path(), &serde_json::from_value(document).expect("a product"))
+    };
+    let recursive = |document: &mut serde_json::Value| {
+        let mut other = document["result"]["coefficients"][0].clone();
+        other["solution"] = json!("es-akf");
+        document["result"]["coefficients"].as_array_mut().expect("coefficients").push(other);
+    };
+    let compared = of(1, recursive);
+    let alone = of(2, |_| ());
+    let empty = of(3, |document| document["result"]["coefficients"] = json!([]));
+    let unspoken = of(4, |document| document["result"]["verdict"] = json!(null));
+    let joint = of(5, |document| document["header"]["non_standard_attributes"]["product"] = json!("COM2"));
+    let lost = of(6, |document| document["quality"]["data_loss"] = json!(true));
+    let site = site(folder.path());
+    for (id, class, said) in [
+        (&compared, "good", "The recursive and the batch solution agree"),
+        (&alone, "good", "there is no recursive solution to compare with"),
+        (&empty, "bad", "It has no values"),
+        (&unspoken, "weak", "No two solutions were compared"),
+        (&joint, "good", "What fits all days fits each"),
+        (&lost, "lost", "data were lost"),
+    ] {
+        let text = page(&site, &format!("/day/{id}"));
+        let sentence = text.split("<p class=\"verdict ").nth(1).and_then(|rest| rest.split("</p>").next());
+        let sentence = sentence.expect("a verdict");
+        assert!(sentence.starts_with(class) && sentence.contains(said), "{id}: {sentence}");
+        assert!(!sentence.contains("A diagnosis found no effect missing"), "{id}: {sentence}");
+    }
+    assert!(page(&site, &format!("/day/{compared}")).contains("--into SET --from 2027-01-02 --until 2027-01-03"));
+
+    let mut archive = Archive::open(folder.path()).expect("an archive");
+    for (program, unexplained, class, said) in [
+        (env!("CARGO_PKG_VERSION"), json!(null), "good", "A diagnosis found no effect missing"),
+        (env!("CARGO_PKG_VERSION"), json!("a transient is left"), "bad", "a transient is left"),
+        ("0.0.1", json!(null), "good", "release 0.0.1 made it"),
+    ] {
+        let extract = json!({
+            "format": "dragfree-extract/1", "product": compared, "program": program,
+            "coefficients": [{"name": "offset.b.x", "unit": "m"}], "information": [4.0], "score": [4.0],
+            "chi2": 10.0, "numbers": 10.0, "surveys": [], "channels": {}, "named": [], "levels": [],
+            "trials": {"forms": {}}, "unexplained": unexplained, "not_tried": []
+        });
+        let text = serde_json::to_vec(&extract).expect("JSON");
+        drop(archive.keep_extract(&compared, &text, &stamp()).expect("kept"));
+        let text = page(&site, &format!("/day/{compared}"));
+        let sentence = text.split("<p class=\"verdict ").nth(1).and_then(|rest| rest.split("</p>").next());
+        let sentence = sentence.expect("a verdict");
+        assert!(sentence.starts_with(class) && sentence.contains(said), "{program}: {sentence}");
     }
 }
 

@@ -182,6 +182,11 @@ impl Extract {
         &self.housekeeping
     }
 
+    /// Why this product alone is not explained; none where it is.
+    pub(crate) fn unexplained(&self) -> Option<&str> {
+        self.unexplained.as_deref()
+    }
+
     /// Levels of noise that effects could state.
     pub(crate) fn levels(&self) -> &[NoiseLevel] {
         &self.levels

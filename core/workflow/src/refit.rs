@@ -39,6 +39,7 @@ pub struct Basis {
     switches: Vec<Switch>,
     trials: Trials,
     named: Vec<String>,
+    unexplained: Vec<String>,
     not_tried: BTreeMap<String, String>,
     /// Housekeeping channels with their units.
     housekeeping: BTreeMap<String, String>,
@@ -173,6 +174,7 @@ impl Basis {
             days.push(day);
         }
         let named = named_by(&extracts, &switches);
+        let unexplained = extracts.iter().filter_map(Extract::unexplained).map(str::to_owned).collect();
         let housekeeping = extracts.iter().flat_map(Extract::housekeeping);
         let housekeeping = housekeeping.map(|(name, unit)| (name.clone(), unit.clone())).collect();
         for (day, mut extract) in days.iter_mut().zip(extracts) {
@@ -187,6 +189,7 @@ impl Basis {
             switches,
             trials,
             named,
+            unexplained,
             not_tried,
             settings,
             housekeeping,
@@ -202,6 +205,11 @@ impl Basis {
     /// Effects that the products' own diagnoses name, by [`Effect::name`].
     pub fn named(&self) -> &[String] {
         &self.named
+    }
+
+    /// Why the products' own diagnoses say that the model does not explain them, beside what they name.
+    pub fn unexplained(&self) -> &[String] {
+        &self.unexplained
     }
 
     /// Housekeeping channels of the products, as expressions name them, with their units.

@@ -226,6 +226,16 @@ impl Outcome {
         let first = of(Role::Adopted).or_else(named).or_else(|| of(Role::Batch)).or_else(|| all.first());
         all.iter().filter(|c| first.is_some_and(|first| c.solution == first.solution)).collect()
     }
+
+    /// Whether a recursive solution stands beside the batch one, so that they can agree.
+    pub fn is_compared(&self) -> bool {
+        let valued = || self.coefficients.iter().filter(|c| c.value.is_finite() && c.sigma.is_finite());
+        let of = |role: Role| valued().any(|c| c.role == Some(role));
+        // Products from before solutions had roles have the name alone.
+        let mut others: Vec<&str> = valued().filter(|c| c.role.is_none()).map(|c| c.solution.as_str()).collect();
+        others.retain(|solution| *solution != "adopted");
+        of(Role::Recursive) && of(Role::Batch) || others.iter().any(|solution| *solution != others[0])
+    }
 }
 
 /// One coefficient of one solution.

@@ -87,7 +87,7 @@ fn setup(bench: &Bench, global: &Global, starts: bool) -> Result<Setup, Failure>
         steps: operations.as_ref().map(|o| o.steps.clone().into_iter().collect()).unwrap_or_default(),
         flags: super::repeated(Some(&archive), global),
         software: SOFTWARE,
-        today: chrono::DateTime::<chrono::Utc>::from(SystemTime::now()).date_naive(),
+        today: Box::new(|| chrono::DateTime::<chrono::Utc>::from(SystemTime::now()).date_naive()),
         archive,
     })
 }

@@ -12,12 +12,17 @@ use dragfree_workflow::campaign::{self as workflow, Spec, Task, Worker};
 use dragfree_workflow::operations::{Operations, Planner};
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, SystemTime};
 
 /// How often it is looked whether a task on this machine has ended.
 const LOOK: Duration = Duration::from_millis(20);
+
+/// How much is shown of what a task has said, bytes from its end.
+const LAST_WORDS_BYTES: u64 = 1 << 14;
 
 pub(super) fn execute(command: &Campaign, global: &Global, paint: Paint) -> Result<Done, Failure> {
     match command {
@@ -103,7 +108,8 @@ fn task(folder: &Path, id: Option<&str>, number: Option<usize>, global: &Global)
 fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let tasks = workflow::read(folder)?;
     let exe = std::env::current_exe().at("find", "this program")?;
-    let mut running: Vec<(String, Child)> = Vec::new();
+    // A file takes whatever a plugin says; a pipe that nobody reads would hold its task up.
+    let mut running: Vec<(String, Child, File)> = Vec::new();
     let mut tried = BTreeSet::new();
     let mut errors: Vec<String> = Vec::new();
     loop {
@@ -112,24 +118,24 @@ fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<D
             let mut command = Command::new(&exe);
             command.args(["--quiet", "--threads", "1"]);
             command.args(global.plugin_dir.iter().flat_map(|dir| [Path::new("--plugin-dir"), dir.as_path()]));
+            command.args(["--plugin-time-limit", &global.plugin_time_limit.to_string()]);
             command.envs(global.plugin_key.iter().map(|key| (super::PLUGIN_KEY, key)));
-            command.args(["campaign", "task"]).arg(folder).arg(&id).stdout(Stdio::null()).stderr(Stdio::piped());
+            let said = tempfile::tempfile().at("make a file in", &std::env::temp_dir())?;
+            let stderr = said.try_clone().at("open", &std::env::temp_dir())?;
+            command.args(["campaign", "task"]).arg(folder).arg(&id).stdout(Stdio::null()).stderr(stderr);
             let child = command.spawn().at("start", &exe)?;
-            running.push((id.clone(), child));
+            running.push((id.clone(), child, said));
             tried.insert(id);
         }
         if running.is_empty() {
             break;
         }
         let mut left = Vec::new();
-        for (id, mut child) in running {
-            if child.try_wait().at("wait for", &exe)?.is_none() {
-                left.push((id, child));
-                continue;
-            }
-            let output = child.wait_with_output().at("wait for", &exe)?;
-            if !output.status.success() {
-                errors.push(format!("task {id}: {}", String::from_utf8_lossy(&output.stderr).trim()));
+        for (id, mut child, said) in running {
+            match child.try_wait().at("wait for", &exe)? {
+                None => left.push((id, child, said)),
+                Some(status) if status.success() => {}
+                Some(_) => errors.push(format!("task {id}: {}", last_words(said))),
             }
         }
         running = left;
@@ -141,11 +147,26 @@ fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<D
     }
     if !errors.is_empty() {
         done.code = 1;
-        if !global.json {
-            done.text.extend(errors.iter().map(|error| text::labelled(&paint.bad("error"), error)));
+        if global.json {
+            let mut value: serde_json::Value = serde_json::from_str(&done.text)?;
+            value["errors"] = serde_json::json!(errors);
+            return Ok(Done { code: done.code, ..Done::json(&value) });
         }
+        done.text.extend(errors.iter().map(|error| text::labelled(&paint.bad("error"), error)));
     }
     Ok(done)
+}
+
+/// The last of what a task has said.
+fn last_words(mut said: File) -> String {
+    let mut words = Vec::new();
+    let end = said.seek(SeekFrom::End(0)).unwrap_or(0);
+    let read =
+        said.seek(SeekFrom::Start(end.saturating_sub(LAST_WORDS_BYTES))).and_then(|_| said.read_to_end(&mut words));
+    match read {
+        Ok(_) => String::from_utf8_lossy(&words).trim().to_owned(),
+        Err(error) => format!("what it said cannot be read: {error}"),
+    }
 }
 
 fn commit(folder: &Path, global: &Global) -> Result<Done, Failure> {

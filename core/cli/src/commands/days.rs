@@ -97,8 +97,7 @@ pub(super) fn day(command: &DayCommand, global: &Global, paint: Paint) -> Result
     };
     let mut meter = Meter::new("day", global);
     let ran = desk.planner(global)?.run(planned, &mut |progress| meter.show(&progress))?;
-    let told = vec![Told::of(&ran, planned.day.reasons.clone())];
-    follow(&desk.operations, &ran)?;
+    let told = vec![Told::of(&desk.operations, &ran, planned.day.reasons.clone())];
     Ok(done(&told, &desk.inbox, global, paint))
 }
 
@@ -110,27 +109,33 @@ pub(super) fn catch_up(command: &CatchUp, global: &Global, paint: Paint) -> Resu
         return Ok(planned(days.iter().filter(due), &desk.inbox, global, paint));
     }
     let _held = desk.hold()?;
-    let told = run_due(&mut desk, command.until, global)?;
+    let mut told = Vec::new();
+    let ended = run_due(&mut desk, command.until, global, &mut |day| told.push(day));
+    if let Err(error) = ended {
+        // What was run is told too.
+        if !told.is_empty() {
+            crate::output::print(&done(&told, &desk.inbox, global, paint).text)?;
+        }
+        return Err(error);
+    }
     Ok(done(&told, &desk.inbox, global, paint))
 }
 
-/// Runs the days that are due.
-fn run_due(desk: &mut Desk, until: Option<NaiveDate>, global: &Global) -> Result<Vec<Told>, Failure> {
+/// Runs the days that are due, with the operator's commands for each at once; `told` has what came of it.
+fn run_due(
+    desk: &mut Desk,
+    until: Option<NaiveDate>,
+    global: &Global,
+    told: &mut dyn FnMut(Told),
+) -> Result<(), Failure> {
     desk.read_inbox(global)?;
-    let mut reasons: Vec<Vec<String>> = Vec::new();
     let planner = desk.planner(global)?;
-    let mut each = |planned: &Planned| -> Box<dyn FnMut(Progress)> {
-        reasons.push(planned.day.reasons.clone());
+    let mut begins = |_: &Planned| -> Box<dyn FnMut(Progress)> {
         let mut meter = Meter::new("day", global);
         Box::new(move |progress| meter.show(&progress))
     };
-    let ran = workflow::catch_up(&planner, &desk.inbox, until, &mut each)?;
-    let mut told = Vec::new();
-    for (ran, reasons) in ran.iter().zip(reasons) {
-        follow(&desk.operations, ran)?;
-        told.push(Told::of(ran, reasons));
-    }
-    Ok(told)
+    let mut ran = |planned: &Planned, ran: Ran| told(Told::of(&desk.operations, &ran, planned.day.reasons.clone()));
+    Ok(workflow::catch_up(&planner, &desk.inbox, until, &mut begins, &mut ran)?)
 }
 
 pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Done, Failure> {
@@ -149,13 +154,16 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
     let settle = Duration::from_secs_f64(command.settle_s);
     let stop = dragfree_engine::stop::flag();
     while !stop.load(Ordering::Relaxed) {
-        let told = run_due(&mut desk, None, global);
-        match told {
-            Ok(told) => {
-                for day in told {
-                    crate::output::print(&day.line(paint))?;
-                }
+        let mut printed = Ok(());
+        let mut print = |day: Told| {
+            if printed.is_ok() {
+                printed = crate::output::print(&day.line(paint));
             }
+        };
+        let ended = run_due(&mut desk, None, global, &mut print);
+        printed?;
+        match ended {
+            Ok(()) => {}
             Err(_) if stop.load(Ordering::Relaxed) => break,
             Err(error) => return Err(error),
         }
@@ -255,11 +263,15 @@ struct Told {
     verdict: Option<String>,
     reasons: Vec<String>,
     failed: Option<String>,
+    /// Commands of the operators that failed.
+    commands_failed: Vec<String>,
     code: u8,
 }
 
 impl Told {
-    fn of(ran: &Ran, reasons: Vec<String>) -> Self {
+    /// Runs the operator's commands for what came of a day, and tells both.
+    fn of(operations: &Operations, ran: &Ran, reasons: Vec<String>) -> Self {
+        let commands_failed = follow(operations, ran);
         let (product, verdict, failed, code) = match &ran.outcome {
             Outcome::Product(written) => {
                 let Written { product, .. } = &**written;
@@ -268,7 +280,8 @@ impl Told {
             }
             Outcome::Failed(reason) => (None, None, Some(reason.clone()), 1),
         };
-        Self { day: ran.day, product, verdict, reasons, failed, code }
+        let code = if commands_failed.is_empty() { code } else { 1 };
+        Self { day: ran.day, product, verdict, reasons, failed, commands_failed, code }
     }
 
     fn line(&self, paint: Paint) -> String {
@@ -279,6 +292,7 @@ impl Told {
         if let Some(reason) = &self.failed {
             text += &text::labelled("", reason);
         }
+        self.commands_failed.iter().for_each(|what| text += &text::labelled("", what));
         text
     }
 }
@@ -293,7 +307,7 @@ fn done(told: &[Told], inbox: &Inbox, global: &Global, paint: Paint) -> Done {
             .iter()
             .map(|t| {
                 json!({"day": t.day.to_string(), "product": t.product, "verdict": t.verdict, "reasons": t.reasons,
-                    "failed": t.failed, "exit_code": t.code})
+                    "failed": t.failed, "commands_failed": t.commands_failed, "exit_code": t.code})
             })
             .collect();
         return Done { code, ..Done::json(&json!({"days": days, "strangers": strangers_json(inbox)})) };
@@ -316,13 +330,13 @@ fn strangers_json(inbox: &Inbox) -> Vec<Value> {
     inbox.strangers.iter().map(entry).collect()
 }
 
-/// Runs the operator's command for what came of a day.
-fn follow(operations: &Operations, ran: &Ran) -> Result<(), Failure> {
-    let Outcome::Product(written) = &ran.outcome else { return Ok(()) };
+/// Runs the operator's commands for what came of a day. Gives those that failed: other days go on, and theirs too.
+fn follow(operations: &Operations, ran: &Ran) -> Vec<String> {
+    let Outcome::Product(written) = &ran.outcome else { return Vec::new() };
     let Product { quality, .. } = &written.product;
     let due = [(quality.data_loss, &operations.on_data_loss), (quality.inconsistent, &operations.on_inconsistent)];
-    for command in due.into_iter().filter(|(is, _)| *is).filter_map(|(_, command)| command.as_ref()) {
-        let folder = operations.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = operations.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let run = |command: &String| {
         let status = std::process::Command::new("sh")
             .args(["-c", command])
             .current_dir(folder)
@@ -330,10 +344,13 @@ fn follow(operations: &Operations, ran: &Ran) -> Result<(), Failure> {
             .env("DRAGFREE_PRODUCT_PATH", &written.path)
             .env("DRAGFREE_DAY", ran.day.to_string())
             .stdout(std::io::stderr())
-            .status()?;
-        if !status.success() {
-            return Err(format!("{}: the command `{command}` failed: {status}", operations.path.display()).into());
-        }
-    }
-    Ok(())
+            .status();
+        let why = match status {
+            Ok(status) if status.success() => return None,
+            Ok(status) => status.to_string(),
+            Err(error) => error.to_string(),
+        };
+        Some(format!("{}: the command `{command}` failed: {why}", operations.path.display()))
+    };
+    due.into_iter().filter(|(is, _)| *is).filter_map(|(_, command)| command.as_ref()).filter_map(run).collect()
 }

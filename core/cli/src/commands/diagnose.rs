@@ -165,7 +165,7 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
         );
     }
     if let Some(f) = accepted.first() {
-        let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}{repeated}", f.effect, f.instance);
+        let _ = writeln!(out, "\nnext      {}", added(f, repeated));
     }
     let first = d.formulas.first().filter(|_| together(d).is_empty());
     for f in together(d).into_iter().chain(first) {
@@ -182,13 +182,14 @@ fn together(d: &Diagnosis) -> Vec<&Found> {
     d.formulas.iter().filter(|f| f.accepted).collect()
 }
 
-/// The command that adds a formula to a model.
+/// The command that adds an effect to a model, in the form that was found.
 fn added(f: &Found, repeated: &str) -> String {
     let set = |(key, value): (&String, &serde_json::Value)| match value {
         serde_json::Value::Array(ends) => {
             format!(" --set {key}={}", ends.iter().map(ToString::to_string).collect::<Vec<_>>().join(","))
         }
-        value => format!(" --set \"{key}={}\"", value.as_str().unwrap_or_default()),
+        serde_json::Value::String(text) => format!(" --set \"{key}={text}\""),
+        value => format!(" --set {key}={value}"),
     };
     let parameters: String = f.shape.iter().map(set).collect();
     format!("dragfree model add MODEL.toml {}:{}{parameters}{repeated}", f.effect, f.instance)

@@ -126,9 +126,7 @@ fn public_key(option: &str, given: &str) -> Result<PublicKey, Failure> {
 /// This program again, for a plugin that is to run in a process of its own.
 fn isolation(global: &Global) -> Result<Isolation, Failure> {
     let program = std::env::current_exe().map_err(|error| format!("this program cannot find itself: {error}"))?;
-    // The child's own limit is for the case that nobody waits for it any more.
-    let its_limit = (2.0 * global.plugin_time_limit).to_string();
-    let arguments = ["plugins", "serve", "--quiet", "--plugin-time-limit", &its_limit].map(OsString::from).to_vec();
+    let arguments = ["plugins", "serve", "--quiet"].map(OsString::from).to_vec();
     Ok(Isolation { program, arguments, limit: Duration::from_secs_f64(global.plugin_time_limit) })
 }
 

@@ -322,7 +322,8 @@ pub fn plan(planner: &Planner<'_>, archive: &Archive, inbox: &Inbox) -> Result<V
 }
 
 /// Runs in order every day up to `until` that has no product or one that would come out otherwise now; a day that
-/// failed with the same inputs is left out. `each` is told a day before it is run, and what came of it.
+/// failed with the same inputs is left out. `begins` is told a day before it is run, and `ran` at once what came of it:
+/// a later day may end the program.
 ///
 /// # Errors
 /// The archive cannot be read or written, or somebody asked to stop.
@@ -330,8 +331,9 @@ pub fn catch_up(
     planner: &Planner<'_>,
     inbox: &Inbox,
     until: Option<NaiveDate>,
-    each: &mut dyn FnMut(&Planned) -> Report,
-) -> Result<Vec<Ran>, WorkflowError> {
+    begins: &mut dyn FnMut(&Planned) -> Report,
+    ran: &mut dyn FnMut(&Planned, Ran),
+) -> Result<(), WorkflowError> {
     let archive = Archive::create(&planner.operations.archive).map_err(EngineError::from)?;
     let days = plan(planner, &archive, inbox)?;
     drop(archive);
@@ -339,12 +341,13 @@ pub fn catch_up(
         let day = &planned.day;
         !day.reasons.is_empty() && day.failed.is_none() && until.is_none_or(|until| day.day <= until)
     };
-    let mut ran = Vec::new();
     for planned in days.iter().filter(due) {
-        let mut progress = each(planned);
-        ran.push(planner.run(planned, &mut *progress)?);
+        let mut progress = begins(planned);
+        let done = planner.run(planned, &mut *progress)?;
+        drop(progress);
+        ran(planned, done);
     }
-    Ok(ran)
+    Ok(())
 }
 
 /// The time of a day, Unix ns.

@@ -85,6 +85,7 @@ fn basis(days: &[Data]) -> Basis {
         switches: (OFFSETS..n).map(switch).collect(),
         trials: serde_json::from_value(json!({ "forms": { "effect": n - OFFSETS, "louder": 1.0 } })).expect("trials"),
         named: Vec::new(),
+        unexplained: Vec::new(),
         not_tried: BTreeMap::new(),
         housekeeping: BTreeMap::new(),
         divided: Mutex::default(),
