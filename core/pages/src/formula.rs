@@ -86,12 +86,13 @@ impl Site {
         let model = self.setup.model.as_ref().map_or_else(|| "MODEL.toml".to_owned(), |m| shell(&m.to_string_lossy()));
         let set = |key: &str, value: &str| format!(" --set {}", shell(&format!("{key}={value}")));
         format!(
-            "dragfree model add {model} {}{}{}{}{}",
+            "dragfree model add {model} {}{}{}{}{}{}",
             shell(&format!("formula:{}", typed.name.trim())),
             set("acts_on", &typed.acts_on),
             set("expression", &typed.expression),
             set("unit", typed.unit.trim()),
-            set("range", &format!("{},{}", typed.lower.trim(), typed.upper.trim()))
+            set("range", &format!("{},{}", typed.lower.trim(), typed.upper.trim())),
+            self.setup.model_flags
         )
     }
 

@@ -83,7 +83,7 @@ pub(crate) fn commands(site: &Site, on: &[&Effect]) -> Vec<String> {
     let of = |e: &&Effect| {
         let shape: String = e.shape.iter().map(set).collect();
         let name = if e.instance.is_empty() { e.effect.clone() } else { format!("{}:{}", e.effect, e.instance) };
-        format!("dragfree model add {model} {}{shape}{}", shell(&name), level(e))
+        format!("dragfree model add {model} {}{shape}{}{}", shell(&name), level(e), site.setup.model_flags)
     };
     on.iter().map(of).collect()
 }

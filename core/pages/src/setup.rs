@@ -31,6 +31,8 @@ pub struct Setup {
     pub steps: Vec<(String, String)>,
     /// What commands repeat so that they find the same archive and plugins, a space before each word.
     pub flags: String,
+    /// The same for `dragfree model add`: the mission that effects are tried with, and plugins.
+    pub model_flags: String,
     /// Name and version of the program.
     pub software: &'static str,
     /// Tells which day it is, UTC: a server stays for weeks.

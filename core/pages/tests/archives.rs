@@ -76,6 +76,7 @@ fn site(archive: &Path) -> Site {
         events: None,
         steps: Vec::new(),
         flags: String::new(),
+        model_flags: String::new(),
         software: "dragfree 0.1.0",
         today: Box::new(|| "2035-01-01".parse().expect("a day")),
     })

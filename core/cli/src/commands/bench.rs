@@ -3,7 +3,7 @@
 use super::{Done, SOFTWARE, products};
 use crate::args::{Bench, Global, Report, Serve};
 use crate::failure::Failure;
-use crate::{output, truth};
+use crate::{output, text, truth};
 use dragfree_archive::Archive;
 use dragfree_pages::jobs::{Job, Starter};
 use dragfree_pages::server::{Ready, serve as pages};
@@ -11,7 +11,7 @@ use dragfree_pages::{Setup, Site, Truth};
 use dragfree_workflow::operations::Operations;
 use serde_json::json;
 use std::io::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::SystemTime;
 
@@ -75,6 +75,8 @@ fn setup(bench: &Bench, global: &Global, starts: bool) -> Result<Setup, Failure>
     products::archive(&archive)?;
     let of = |file: fn(&Operations) -> Option<std::path::PathBuf>| operations.as_ref().and_then(file);
     let mission = bench.mission.clone().or_else(|| of(|o| o.mission.clone()));
+    let named = |path: &PathBuf| format!(" --mission {}", text::quoted(&path.to_string_lossy()));
+    let mission_flag = mission.as_ref().map(named).unwrap_or_default();
     let truth = bench.truth.as_deref().map(truth::first).transpose()?;
     let truth = truth.map(|values| -> Truth { Box::new(move |name| dragfree_score::offset(&values, name)) });
     Ok(Setup {
@@ -86,6 +88,7 @@ fn setup(bench: &Bench, global: &Global, starts: bool) -> Result<Setup, Failure>
         events: of(|o| o.events.clone()),
         steps: operations.as_ref().map(|o| o.steps.clone().into_iter().collect()).unwrap_or_default(),
         flags: super::repeated(Some(&archive), global),
+        model_flags: mission_flag + &super::repeated(None, global),
         software: SOFTWARE,
         today: Box::new(|| chrono::DateTime::<chrono::Utc>::from(SystemTime::now()).date_naive()),
         archive,
