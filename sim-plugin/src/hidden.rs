@@ -1,10 +1,11 @@
 //! Effects that `--hidden SEED` adds: drawn from the seed alone, with sizes of 3σ to 30σ for the simulated time.
 
+use dragfree_physics::mission::Mission;
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde_json::{Value, json};
 
-use crate::effects::EffectRequest;
+use crate::effects::{Basis, EffectRequest, Place};
 use crate::random::stream;
 
 /// Smallest and largest expected significance of an effect.
@@ -234,20 +235,21 @@ pub struct Hidden {
 }
 
 impl Hidden {
-    /// Draws by `seed` for a simulation of `days` of a spacecraft with these test masses.
+    /// Draws by `seed` for a simulation of `days` of a mission, among what can act there. Sizes and significance are
+    /// those of the bundled mission's noise.
     ///
     /// # Panics
     /// Never: every row of the table names an effect, its instances and its parameters, as a test sees to.
-    pub fn draw(seed: u64, days: f64, test_masses: &[String]) -> Self {
+    pub fn draw(seed: u64, days: f64, mission: &Mission) -> Self {
         let mut rng = stream(seed, "hidden");
         let luck: f64 = rng.random();
         let mut drawn: Vec<Drawn> = Vec::new();
         if luck >= NOTHING {
             let uncovered = luck >= 1.0 - UNCOVERED;
             let pair = luck < NOTHING + PAIR;
-            drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered != uncovered));
+            drawn.extend(draw_one(&mut rng, days, mission, |row| row.covered != uncovered));
             if let (true, Some(first)) = (pair, drawn.first().map(|d| d.request.kind.id)) {
-                drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered && row.id != first));
+                drawn.extend(draw_one(&mut rng, days, mission, |row| row.covered && row.id != first));
             }
         }
         let salt = (0..4).map(|_| format!("{:016x}", rng.random::<u64>())).collect();
@@ -279,13 +281,18 @@ impl Drawn {
             "effect": request.kind.id,
             "instance": request.instance,
             "size": request.size,
-            "unit": request.kind.size.unit,
+            "unit": if turns(request.place) { "N m s" } else { request.kind.size.unit },
             "shape": shape,
             "covered": self.covered,
             "significance": self.amount.abs() / self.sigma,
             "sigma_expected": self.sigma,
         })
     }
+}
+
+/// Whether the size of an impulse is that of a moment of momentum.
+fn turns(place: Place) -> bool {
+    matches!(place, Place::ScAngle(_))
 }
 
 impl Row {
@@ -344,15 +351,23 @@ fn instance(place: &str, test_masses: &[String]) -> Option<String> {
     Some(format!("{name}{rest}"))
 }
 
+/// Whether an effect of the table can act in an instance of it.
+fn acts(row: &Row, place: &str, mission: &Mission, test_masses: &[String]) -> bool {
+    let parse = |place| EffectRequest::parse(&format!("{}:{place}={}", row.id, row.origin), test_masses).ok();
+    let request = instance(place, test_masses).and_then(parse);
+    request.is_some_and(|request| request.cause(&Basis { mission }).is_ok())
+}
+
 fn draw_one(
     rng: &mut Xoshiro256PlusPlus,
     days: f64,
-    test_masses: &[String],
+    mission: &Mission,
     wanted: impl Fn(&Row) -> bool,
 ) -> Option<Drawn> {
+    let test_masses: &[String] = &mission.test_mass.keys().cloned().collect::<Vec<_>>();
     // An instance at which the effect is significant at every value of the shape parameter.
     let seen = |row: &Row, (place, sigma): &(&str, &[[f64; 2]])| {
-        instance(place, test_masses).is_some() && sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some())
+        acts(row, place, mission, test_masses) && sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some())
     };
     let places = |row: &Row| row.sigmas().filter(|place| seen(row, place)).collect::<Vec<_>>();
     let rows: Vec<&Row> =
@@ -380,19 +395,31 @@ fn draw_one(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::taiji;
     use std::collections::BTreeMap;
 
     fn both() -> Vec<String> {
         ["tm1", "tm2"].map(str::to_owned).to_vec()
     }
 
-    /// With one test mass nothing of a second one is drawn, and its own name is used.
+    /// With one test mass nothing of a second one is drawn, and its own name is used. Where it is free along every axis
+    /// no electrode acts, and thrusters with noise of their own have no other.
     #[test]
-    fn only_test_masses_that_there_are_get_effects() {
-        let one = ["cube".to_owned()];
+    fn only_what_can_act_is_drawn() {
+        let mission = |file: &str| {
+            let value: Value = toml::from_str(file).unwrap();
+            Mission::from_json(&value.to_string()).unwrap()
+        };
+        let single = include_str!("../../fixtures/missions/single.toml").replace("test_mass.tm1", "test_mass.cube");
+        let one = mission(&single);
         let drawn: Vec<Drawn> = (0..500).flat_map(|seed| Hidden::draw(seed, 3.0, &one).drawn).collect();
         let named = |prefix: &str| drawn.iter().filter(|d| d.request.instance.starts_with(prefix)).count();
         assert!(named("cube") > 50 && named("sc.") > 50 && named("tm") == 0 && named("{") == 0);
+        let with = |drawn: &[Drawn], prefix: &str| drawn.iter().any(|d| d.request.kind.id.starts_with(prefix));
+        assert!(!with(&drawn, "es-"));
+        let units = mission(include_str!("../../fixtures/missions/taiji-thrusters.toml"));
+        let drawn: Vec<Drawn> = (0..500).flat_map(|seed| Hidden::draw(seed, 3.0, &units).drawn).collect();
+        assert!(with(&drawn, "es-") && !with(&drawn, "mps-noise") && !with(&drawn, "torque-noise"));
     }
 
     /// Three thousand seeds: the chances within 4.5σ of a binomial (false alarm 7e-6 each), sizes physical,
@@ -402,8 +429,9 @@ mod tests {
         let n = 3000;
         // Three days: offset-drift is not seen in one.
         let (mut nothing, mut pairs, mut uncovered, mut seen) = (0.0, 0.0, 0.0, BTreeMap::new());
+        let mission = taiji();
         for seed in 0..n {
-            let hidden = Hidden::draw(seed, 3.0, &both());
+            let hidden = Hidden::draw(seed, 3.0, &mission);
             nothing += f64::from(hidden.drawn.is_empty());
             pairs += f64::from(hidden.drawn.len() == 2);
             uncovered += f64::from(hidden.drawn.iter().any(|d| !d.covered));
@@ -433,14 +461,15 @@ mod tests {
 
     #[test]
     fn a_seed_draws_the_same_and_another_draws_another() {
-        let text = |seed: u64| Hidden::draw(seed, 2.0, &both()).content(&json!({"noise_seed": 5})).to_string();
+        let mission = taiji();
+        let text = |seed: u64| Hidden::draw(seed, 2.0, &mission).content(&json!({"noise_seed": 5})).to_string();
         assert_eq!(text(4), text(4));
         assert_ne!(text(4), text(5));
         let salts: std::collections::BTreeSet<String> =
-            (0..100).map(|seed| Hidden::draw(seed, 1.0, &both()).salt).collect();
+            (0..100).map(|seed| Hidden::draw(seed, 1.0, &mission).salt).collect();
         assert!(salts.len() == 100 && salts.iter().all(|salt| salt.len() == 64));
         // More days show smaller effects: the same seed aims at the same significance.
-        let one = (0..100).map(|seed| (Hidden::draw(seed, 1.0, &both()), Hidden::draw(seed, 1.2, &both())));
+        let one = (0..100).map(|seed| (Hidden::draw(seed, 1.0, &mission), Hidden::draw(seed, 1.2, &mission)));
         let shrunk = one.filter(|(a, b)| a.drawn.first().is_some_and(|a| a.sigma > b.drawn[0].sigma)).count();
         assert!(shrunk > 50, "{shrunk}");
     }

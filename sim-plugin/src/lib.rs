@@ -316,6 +316,13 @@ impl Source for Sim {
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let mission = Mission::from_json(setup.mission_json())?;
+        let rate_hz = mission.mission.sample_rate_hz;
+        if rate_hz.fract() != 0.0 {
+            return Err(PluginError::new(format!(
+                "mission.sample_rate_hz = {rate_hz}: the simulator computes what is inside the spacecraft every second, so it \
+                 needs a whole number of samples in a second"
+            )));
+        }
         let end_ns = setup.end_ns().ok_or_else(|| {
             PluginError::new("the simulator has no end; give the run a time window, as --hours 6 does")
         })?;
@@ -325,14 +332,16 @@ impl Source for Sim {
                 "parameter com_offset_srf_m = {given:?} must have three components, x, y, z of SRF"
             ))
         })?;
-        let given = setup.text_list("effects")?;
+        let asked = setup.text_list("effects")?;
         let names: Vec<String> = mission.test_mass.keys().cloned().collect();
-        let mut effects = given.iter().map(|text| EffectRequest::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
+        let mut effects = asked.iter().map(|text| EffectRequest::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
         let flown = setup.text_list("manoeuvres")?;
         let manoeuvres = flown.iter().map(|text| Manoeuvre::parse(text, &mission)).collect::<Result<_, _>>();
         let manoeuvres = manoeuvres.map_err(|e| refuse(e.into()))?;
         let days = (end_ns - start_ns) as f64 / 86_400e9;
-        let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days, &names));
+        let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days, &mission));
+        // With every parameter: who scores a diagnosis does not know what stands for one that was left out.
+        let given: Vec<String> = effects.iter().map(ToString::to_string).collect();
         effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.request.clone()));
         let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {

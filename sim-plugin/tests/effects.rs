@@ -249,10 +249,14 @@ fn forces_that_no_bundled_effect_covers() {
     let row = twins.row();
     let want = 1e-12 * (row.inside.battery_a - 2.1) * (row.inside.structure_k - 296.5);
     near(&row.accel_orf_m_s2[0], &(axis(1) * want), 1e-6, "product");
-    let mut twins = Twins::new(&["field-force:tm2.z=0.5"], 60.0);
-    let row = twins.row();
-    let field_t = row.inside.interplanetary_t[2] + row.inside.units_field[1] * dragfree_sim::interior::FIELD_T[1][2];
-    near(&row.accel_orf_m_s2[1], &(axis(2) * 0.5 * field_t.powi(2)), 1e-6, "field");
+    // About s_3 the frame of a test mass is turned, so that x tells the frames apart and z does not.
+    for (place, along) in [("tm2.x", 0), ("tm2.z", 2)] {
+        let mut twins = Twins::new(&[&format!("field-force:{place}=0.5")], 60.0);
+        let row = twins.row();
+        let outside = dcm(1) * Vector3::from(row.inside.interplanetary_t);
+        let field_t = outside[along] + row.inside.units_field[1] * dragfree_sim::interior::FIELD_T[1][along];
+        near(&row.accel_orf_m_s2[1], &(axis(along) * 0.5 * field_t.powi(2)), 1e-6, place);
+    }
 }
 
 /// `χ/(2 μ0 ρ) ∇B²` by differences of the field itself, and `∇(m·B)/m_m`.

@@ -2,6 +2,7 @@
 
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest};
 use dragfree_engine::table::{Batch, TableSpec};
+use dragfree_physics::mission::Mission;
 use dragfree_sim::hidden::Hidden;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -284,8 +285,9 @@ fn what_has_no_sense_is_refused_by_name() {
 #[test]
 fn hidden_effects_leave_no_trace_but_their_own() {
     let library = library();
-    let names = ["tm1", "tm2"].map(str::to_owned);
-    let drawn = |seed: i64| Hidden::draw(seed.cast_unsigned(), 120.0 / 86_400.0, &names).drawn.len();
+    let text = std::fs::read_to_string(root().join("fixtures/missions/taiji.toml")).unwrap();
+    let mission = Mission::from_json(&toml::from_str::<Value>(&text).unwrap().to_string()).unwrap();
+    let drawn = |seed: i64| Hidden::draw(seed.cast_unsigned(), 120.0 / 86_400.0, &mission).drawn.len();
     let something = (0..).find(|seed| drawn(*seed) > 0).unwrap();
     let nothing = (0..).find(|seed| drawn(*seed) == 0).unwrap();
     let hide = |seed: i64| config(120, move |_, p| p["hidden"] = json!(seed));

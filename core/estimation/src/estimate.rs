@@ -128,6 +128,9 @@ pub struct Estimate {
     pub theta: DVector<f64>,
     /// Covariance of the free coefficients; none when there is neither data nor range in some direction.
     pub covariance: Option<DMatrix<f64>>,
+    /// By how much σ of each of them was widened: for residuals beyond the refined Σ or blocks of time that scatter more
+    /// than chance allows, whichever is more, and for information that is uneven in time.
+    pub widened: Vec<f64>,
     /// Directions that data and survey do not see.
     pub weak: Vec<Direction>,
     /// Rows at which the solution stands.
@@ -320,15 +323,15 @@ pub fn estimate_with(
         let linear = Observed { layout, ..*observed };
         scatter(&linear, &inverses, &solved.theta, c, &free, settings.scatter_sigmas)
     });
-    let covariance = covariance.map(|c| {
-        let by_blocks =
-            |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
-        let by_noise = chi2_per_dof.max(1.0).sqrt();
-        let by_time =
-            if even { unevenness(spectra, &kept, layout, &inverses, &free, &c) } else { vec![1.0; free.len()] };
-        let widen: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise) * by_time[k]).collect();
-        DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
-    });
+    let by_blocks = |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
+    let by_noise = chi2_per_dof.max(1.0).sqrt();
+    let by_time = match &covariance {
+        Some(c) if even => unevenness(spectra, &kept, layout, &inverses, &free, c),
+        _ => vec![1.0; free.len()],
+    };
+    let widened: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise) * by_time[k]).collect();
+    let covariance =
+        covariance.map(|c| DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widened[i] * widened[j]));
     let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
         free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
     });
@@ -358,6 +361,7 @@ pub fn estimate_with(
         free,
         theta: solved.theta,
         covariance,
+        widened,
         weak,
         active: solved.active,
         bound_score,

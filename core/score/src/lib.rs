@@ -226,11 +226,18 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
     let only = |unit, value| Ok(vec![part("", unit, value)]);
     let column = |key: &str| shape.get(key).and_then(Value::as_str).unwrap_or_default();
     let (number, axis) = test_mass(&truth.instance);
+    if truth.number("per_day") != 0.0 || truth.number("from_s") != 0.0 {
+        return Err("a size that changes with time has no one value".to_owned());
+    }
     match truth.effect.as_str() {
         "es-gain" | "es-crosstalk" | "mps-gain" | "torque-gain" | "is-scale" | "is-crosstalk" => only("1", truth.size),
         "mps-tilt" => only("rad", truth.size),
         "time-offset" => only("s", truth.size),
         "stiffness" => only("s-2", truth.size),
+        "opening-angle" if ["rate_rad_s", "follow"].iter().all(|moves| truth.number(moves) == 0.0) => {
+            only("rad", truth.size)
+        }
+        "opening-angle" => Err("an angle that changes has no one value".to_owned()),
         "cross-stiffness" => only("m s-2 rad-1", truth.size),
         // The level is a factor of the amplitude, as is the size.
         "mps-noise" | "torque-noise" | "is-noise" if truth.number("line_hz") > 0.0 => {

@@ -209,6 +209,12 @@ fn sizes_become_coefficients() {
     assert_eq!(value(&magnet, json!({"gradient": "hk.magnetic_gradient2_t_m"})), 2e-8 / 4.0);
     assert!(of(&magnet, json!({"gradient": "hk.magnetic_gradient1_t_m"})).is_err());
     assert!(of(&truth("magnetic", "tm2", 1e-5, &json!({})), json!({})).is_err());
+    let opened = |shape: Value| of(&truth("opening-angle", "tm1", 0.02, &shape), json!({}));
+    assert_eq!(opened(json!({"rate_rad_s": 0.0, "follow": 0.0})).unwrap()[0].value, 0.02);
+    assert!(opened(json!({"rate_rad_s": 1e-8})).is_err() && opened(json!({"follow": 1.0})).is_err());
+    for drifts in [json!({"per_day": 0.06}), json!({"from_s": 3600.0})] {
+        assert!(of(&truth("mps-gain", "sc.y", 0.1, &drifts), json!({})).is_err(), "{drifts}");
+    }
     let charge = truth("charge", "tm1", 0.05, &json!({}));
     assert_eq!(value(&charge, json!({"charge": "hk.tm1_charge_c"})), 0.05);
     assert!(of(&charge, json!({"charge": "hk.tm2_charge_c"})).is_err());

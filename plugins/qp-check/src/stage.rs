@@ -534,7 +534,10 @@ impl Linked {
                 let free = solution.free.iter().position(|f| *f == i);
                 let sigma = free.zip(covariance.as_ref()).map(|(k, c)| c[(k, k)].sqrt());
                 let value = free.map(|_| solution.theta[i]);
-                let level = levels.iter().find(|level| level.process == c.noise);
+                // Of several levels of one component the data see the product alone, and the first one moves.
+                let first = self.coefficients.iter().find(|other| other.estimate && other.noise == c.noise);
+                let moves = first.is_some_and(|first| first.name == c.name);
+                let level = levels.iter().find(|level| moves && level.process == c.noise);
                 let (value, sigma) = level.map_or((value, sigma), |level| (Some(level.value), Some(level.sigma)));
                 report.coefficients.push(estimate_of(c, (label, role), value, sigma));
             }
@@ -761,16 +764,10 @@ fn is_differenced(channel: &Column) -> Result<bool, PluginError> {
     }
 }
 
-/// By how much each σ was widened: for residuals beyond the refined Σ, or for blocks of time that scatter more than
-/// chance allows, whichever is more.
+/// By how much each σ was widened.
 fn widened<'a>(solution: &Solution, coefficients: &'a [Coefficient]) -> BTreeMap<&'a str, f64> {
-    let by_noise = solution.quality.chi2_per_dof.max(1.0).sqrt();
-    let by_blocks = |k: usize| {
-        let ratio = solution.scatter.as_ref().and_then(|s| s.ratio.get(k).copied().filter(|ratio| *ratio > s.upper));
-        ratio.unwrap_or(1.0)
-    };
-    let of = |(k, i): (usize, &usize)| (coefficients[*i].name.as_str(), by_blocks(k).max(by_noise));
-    solution.free.iter().enumerate().map(of).collect()
+    let of = |(i, widened): (&usize, &f64)| (coefficients[*i].name.as_str(), *widened);
+    solution.free.iter().zip(&solution.widened).map(of).collect()
 }
 
 fn estimate_of(c: &Coefficient, (solution, role): (&str, Role), value: Option<f64>, sigma: Option<f64>) -> Estimate {

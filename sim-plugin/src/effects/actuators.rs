@@ -1,6 +1,7 @@
 //! Actuators whose output differs from the command.
 
 use dragfree_physics::control::Command;
+use dragfree_physics::mission::{AXES, Mission, MissionError};
 use nalgebra::Matrix3;
 
 use super::request::{Built, EffectRequest, Kind, Number, Place, Shape, sc_axes, tm_axes, tm_pairs};
@@ -61,7 +62,10 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-fn build(request: &EffectRequest, _: &Basis<'_>) -> Built {
+fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
+    if let Place::TmAxis(tm, axis) | Place::TmPair { tm, from: axis, .. } = request.place {
+        electrodes_along(basis.mission, tm, axis)?;
+    }
     let part = |to: usize, from: usize| along(to) * along(from).transpose();
     let (output, matrix) = match (request.kind.id, request.place) {
         ("mps-tilt", Place::ScAxis(axis)) => (Output::Thrust, along(axis).cross_matrix()),
@@ -72,6 +76,18 @@ fn build(request: &EffectRequest, _: &Basis<'_>) -> Built {
         _ => unreachable!("instances are axes and pairs of them"),
     };
     Ok(Box::new(Actuator { output, matrix, size: request.size, per_day: request.shape("per_day") }))
+}
+
+/// That electrodes are commanded along an axis of a test mass.
+fn electrodes_along(mission: &Mission, tm: usize, axis: usize) -> Result<(), MissionError> {
+    match mission.test_mass.iter().nth(tm) {
+        Some((name, section)) if section.is_drag_free(axis) => Err(MissionError::Value {
+            key: format!("test_mass.{name}.drag_free"),
+            value: AXES[axis].to_owned(),
+            reason: "the test mass is free along it: no electrode is commanded there",
+        }),
+        _ => Ok(()),
+    }
 }
 
 enum Output {

@@ -1,6 +1,6 @@
 //! Noise of single thrusters, with correlated force and torque.
 
-use dragfree_physics::mission::MissionError;
+use dragfree_physics::mission::{Mission, MissionError};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 use super::request::{Built, EffectRequest, Kind, Number, Place};
@@ -18,18 +18,24 @@ pub(super) const KINDS: &[Kind] = &[Kind {
     build,
 }];
 
+/// That the thrusters' noise is that along and about the axes, and not of units.
+pub(super) fn noise_along_axes(mission: &Mission) -> Result<(), MissionError> {
+    let units = mission.thrusters.as_ref().map_or(0, |thrusters| thrusters.unit.len());
+    if units == 0 {
+        return Ok(());
+    }
+    Err(MissionError::Value {
+        key: "thrusters.unit".to_owned(),
+        value: format!("{units} units"),
+        reason: "have noise of their own already, which pushes and turns at once: change their asd_n_rthz instead",
+    })
+}
+
 /// Adds `Σ n_i (d_i, r_i × d_i)` of [`Layout::six`]: the cross-spectrum of force and torque is `Σ S d_i (r_i × d_i)ᵀ`.
 struct Correlation(ThrusterNoise);
 
 fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
-    let units = basis.mission.thrusters.as_ref().map_or(0, |thrusters| thrusters.unit.len());
-    if units > 0 {
-        return Err(MissionError::Value {
-            key: "thrusters.unit".to_owned(),
-            value: format!("{units} units"),
-            reason: "have noise of their own already, which pushes and turns at once: change their asd_n_rthz instead",
-        });
-    }
+    noise_along_axes(basis.mission)?;
     Ok(Box::new(Correlation(ThrusterNoise::new(Layout::six(request.size), basis.mission.dt_s()))))
 }
 

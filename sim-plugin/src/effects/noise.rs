@@ -9,6 +9,7 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::f64::consts::TAU;
 
+use super::correlation::noise_along_axes;
 use super::request::{Built, EffectRequest, Kind, Number, Place, Shape, sc_axes, tm_axes};
 use super::{Basis, Cause, Moment, along};
 use crate::plant::{Loads, Plant};
@@ -34,6 +35,7 @@ pub(super) const KINDS: &[Kind] = &[
         help: "thrusters: the force noise along the axis has SIZE times the mission's ASD",
         shape: LINE,
         build: |request, basis| {
+            noise_along_axes(basis.mission)?;
             let table = &basis.mission.noise.thruster_force;
             let shape = Mission::need(table, "noise.thruster_force", "mps-noise")?.shape();
             Excess::boxed(request, basis, &shape)
@@ -46,6 +48,7 @@ pub(super) const KINDS: &[Kind] = &[
         help: "thrusters: the torque noise about the axis has SIZE times the mission's ASD",
         shape: LINE,
         build: |request, basis| {
+            noise_along_axes(basis.mission)?;
             let table = &basis.mission.noise.thruster_torque;
             let shape = Mission::need(table, "noise.thruster_torque", "torque-noise")?.shape();
             Excess::boxed(request, basis, &shape)

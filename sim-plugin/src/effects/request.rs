@@ -231,7 +231,7 @@ impl EffectRequest {
         i.map_or(f64::NAN, |i| self.shape[i])
     }
 
-    pub(super) fn cause(&self, basis: &Basis<'_>) -> Result<Box<dyn Cause>, EffectError> {
+    pub(crate) fn cause(&self, basis: &Basis<'_>) -> Result<Box<dyn Cause>, EffectError> {
         (self.kind.build)(self, basis).map_err(|source| EffectError::Mission { text: self.to_string(), source })
     }
 }

@@ -5,7 +5,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 use super::request::{EffectRequest, Kind, Number, Place, Shape, test_masses, tm_axes};
 use super::{Cause, Moment, along};
-use crate::interior::{FIELD_T, GRADIENT_T_M, Interior, of_housing};
+use crate::interior::{FIELD_T, GRADIENT_T_M, of_housing};
 use crate::plant::Loads;
 
 /// Vacuum permeability, T m/A, and density of the test mass (gold and platinum), kg/m³.
@@ -27,7 +27,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 K-1", -1e-8, 1e-8),
         help: "SIZE times the temperature of the positive face of the housing minus that of the negative one, behind a lag",
         shape: &[Shape::new("lag_s", LAG, 480.0, "lag, s")],
-        build: |request, _| Ok(Lagged::boxed(request, |inside, tm, axis| inside.across_k[tm][axis])),
+        build: |request, _| Ok(Lagged::boxed(request, |now, tm, axis| now.inside.across_k[tm][axis])),
     },
     Kind {
         id: "magnetic",
@@ -57,7 +57,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 A-2", -1e-8, 1e-8),
         help: "SIZE times the square of the battery's current, behind a lag",
         shape: &[Shape::new("lag_s", LAG, 50.0, "lag, s")],
-        build: |request, _| Ok(Lagged::boxed(request, |inside, _, _| inside.battery_a * inside.battery_a)),
+        build: |request, _| Ok(Lagged::boxed(request, |now, _, _| now.inside.battery_a * now.inside.battery_a)),
     },
     Kind {
         id: "product-force",
@@ -66,8 +66,8 @@ pub(super) const KINDS: &[Kind] = &[
         help: "SIZE times the product of battery current and structure temperature, each about its level",
         shape: &[],
         build: |request, _| {
-            Ok(Lagged::boxed(request, |inside, _, _| {
-                (inside.battery_a - CURRENT_A) * (inside.structure_k - STRUCTURE_K)
+            Ok(Lagged::boxed(request, |now, _, _| {
+                (now.inside.battery_a - CURRENT_A) * (now.inside.structure_k - STRUCTURE_K)
             }))
         },
     },
@@ -77,13 +77,14 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 T-2", -1e3, 1e3),
         help: "SIZE times the square of the magnetic field along the axis",
         shape: &[],
-        build: |request, _| Ok(Lagged::boxed(request, |inside, tm, axis| field_t(inside, tm, axis).powi(2))),
+        build: |request, _| Ok(Lagged::boxed(request, |now, tm, axis| field_orf_t(now, tm)[axis].powi(2))),
     },
 ];
 
-/// Field at a test mass along an axis, T.
-fn field_t(inside: &Interior, tm: usize, axis: usize) -> f64 {
-    inside.interplanetary_t[axis] + inside.units_field[tm] * of_housing(&FIELD_T, tm)[axis]
+/// Field at a test mass, ORF, T.
+fn field_orf_t(now: &Moment<'_>, tm: usize) -> Vector3<f64> {
+    now.plant.tm[tm].dcm_orf_from_srf * Vector3::from(now.inside.interplanetary_t)
+        + Vector3::from(*of_housing(&FIELD_T, tm)) * now.inside.units_field[tm]
 }
 
 /// A force proportional to a quantity of the interior behind a first-order lag.
@@ -92,13 +93,13 @@ struct Lagged {
     axis: usize,
     size: f64,
     lag_s: f64,
-    driver: fn(&Interior, usize, usize) -> f64,
+    driver: fn(&Moment<'_>, usize, usize) -> f64,
     /// The lagged quantity; the first sample starts it settled.
     value: Option<f64>,
 }
 
 impl Lagged {
-    fn boxed(request: &EffectRequest, driver: fn(&Interior, usize, usize) -> f64) -> Box<dyn Cause> {
+    fn boxed(request: &EffectRequest, driver: fn(&Moment<'_>, usize, usize) -> f64) -> Box<dyn Cause> {
         let Place::TmAxis(tm, axis) = request.place else { unreachable!("instances are axes of a test mass") };
         let lag_s = if request.kind.shape.is_empty() { 0.0 } else { request.shape("lag_s") };
         Box::new(Self { tm, axis, size: request.size, lag_s, driver, value: None })
@@ -107,7 +108,7 @@ impl Lagged {
 
 impl Cause for Lagged {
     fn push(&mut self, now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, loads: &mut Loads) {
-        let target = (self.driver)(now.inside, self.tm, self.axis);
+        let target = (self.driver)(now, self.tm, self.axis);
         let value = self.value.get_or_insert(target);
         *value += (target - *value) * if self.lag_s > 0.0 { -(-now.dt_s / self.lag_s).exp_m1() } else { 1.0 };
         loads.tm[self.tm].acceleration_orf_m_s2[self.axis] += self.size * *value;
@@ -139,8 +140,7 @@ impl Cause for Magnetic {
     fn push(&mut self, now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, loads: &mut Loads) {
         let body = &now.plant.tm[self.tm];
         let units = now.inside.units_field[self.tm];
-        let field = body.dcm_orf_from_srf * Vector3::from(now.inside.interplanetary_t)
-            + Vector3::from(*of_housing(&FIELD_T, self.tm)) * units;
+        let field = field_orf_t(now, self.tm);
         let per_field = self.susceptibility / (MU_0_T_M_A * DENSITY_KG_M3);
         let source = field * per_field + along(0) * (self.moment_a_m2 / body.mass_kg);
         loads.tm[self.tm].acceleration_orf_m_s2 += gradient(self.tm) * source * units;
