@@ -363,7 +363,7 @@ impl Source for Sim {
                 .collect();
             let masses_kg: Vec<f64> = mission.test_mass.values().map(|tm| tm.mass_kg).collect();
             let about = serde_json::json!({
-                "test_mass_kg": masses_kg,
+                "test_mass_kg": masses_kg, "test_masses": names,
                 "mission": mission.mission.name, "spacecraft": mission.mission.spacecraft, "noise_seed": seed,
                 "start_ns": start_ns, "end_ns": end_ns, "given": given, "offset_m": offset_m,
             });

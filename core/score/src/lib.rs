@@ -203,17 +203,28 @@ pub struct Expected {
     pub value: f64,
 }
 
-/// Number of a test mass, the digits at the end of its name, and axis, of `tm1.x` or `tm1`.
-fn test_mass(instance: &str) -> (&str, &str) {
-    let (mass, axis) = instance.split_once('.').unwrap_or((instance, ""));
-    (mass.trim_start_matches(|c: char| !c.is_ascii_digit()), axis)
+/// Test mass and axis of `tm1.x` or `tm1`.
+fn parts(instance: &str) -> (&str, &str) {
+    instance.split_once('.').unwrap_or((instance, ""))
+}
+
+/// The digits at the end of a test mass's name, which the bundled missions have.
+fn digits(mass: &str) -> &str {
+    mass.trim_start_matches(|c: char| !c.is_ascii_digit())
+}
+
+/// Number of a test mass in the order of their names, from 1, as the simulator numbers them.
+fn number_of(mass: &str, sealed: &Value) -> String {
+    let names = sealed["test_masses"].as_array();
+    let at = names.and_then(|names| names.iter().position(|name| name == mass));
+    at.map_or_else(|| digits(mass).to_owned(), |at| (at + 1).to_string())
 }
 
 /// True value of a coefficient `com-offset.NAME.AXIS`, m, in the first message of the truth of a simulation, by field
 /// path.
 pub fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
-    let (number, axis) = test_mass(coefficient.strip_prefix("com-offset.")?);
-    truth.get(&format!("b{number}_orf_m.{axis}")).copied()
+    let (mass, axis) = parts(coefficient.strip_prefix("com-offset.")?);
+    truth.get(&format!("b{}_orf_m.{axis}", digits(mass))).copied()
 }
 
 /// True values of the coefficients of a model's effect, for the shape that was found. `sealed` is the whole sealed
@@ -225,7 +236,8 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
     let part = |part, unit, value| Expected { part, unit, value };
     let only = |unit, value| Ok(vec![part("", unit, value)]);
     let column = |key: &str| shape.get(key).and_then(Value::as_str).unwrap_or_default();
-    let (number, axis) = test_mass(&truth.instance);
+    let (mass, axis) = parts(&truth.instance);
+    let number = number_of(mass, sealed);
     if truth.number("per_day") != 0.0 || truth.number("from_s") != 0.0 {
         return Err("a size that changes with time has no one value".to_owned());
     }
@@ -280,7 +292,7 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             }
         }
         "charge" => match column("charge") {
-            charge if charge == format!("hk.tm{number}_charge_c") => only("V", truth.size),
+            charge if charge == format!("hk.{mass}_charge_c") => only("V", truth.size),
             other => Err(format!("the candidate follows {other}, the truth its own test mass's charge")),
         },
         "magnetic" if truth.size != 0.0 => {
@@ -297,7 +309,7 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
                 other => Err(format!("the candidate follows {other}, the truth its own test mass's gradient")),
             }
         }
-        "impulse" if truth.instance.starts_with("tm") => only("N s", truth.size),
+        "impulse" if mass != "sc" => only("N s", truth.size),
         "impulse" if ["x", "y", "z"].contains(&axis) => {
             let arm = ["arm_x_m", "arm_y_m", "arm_z_m"].map(|name| truth.number(name));
             let along = ["x", "y", "z"].map(|letter| if letter == axis { truth.size } else { 0.0 });
@@ -332,7 +344,7 @@ fn expected_shape(truth: &Truth) -> Map<String, Value> {
         "thermal" => given(&["lag_s"], 1.0),
         // The model's resonance is that with the spacecraft free.
         "slosh" => given(&["f0_hz", "zeta"], (1.0 - truth.size).sqrt().recip()),
-        "impulse" if truth.instance.starts_with("tm") => given(&["rise_s", "decay_s"], 1.0),
+        "impulse" if parts(&truth.instance).0 != "sc" => given(&["rise_s", "decay_s"], 1.0),
         "impulse" if ["sc.phi", "sc.theta", "sc.psi"].contains(&truth.instance.as_str()) => given(&["pulse_s"], 1.0),
         _ => Map::new(),
     }

@@ -218,6 +218,15 @@ fn sizes_become_coefficients() {
     let charge = truth("charge", "tm1", 0.05, &json!({}));
     assert_eq!(value(&charge, json!({"charge": "hk.tm1_charge_c"})), 0.05);
     assert!(of(&charge, json!({"charge": "hk.tm2_charge_c"})).is_err());
+    // The simulator numbers test masses in the order of their names, whatever these are.
+    let mut named = sealed(&[]);
+    named["test_masses"] = json!(["a2", "cube"]);
+    let of_named = |t: &Truth, shape: Value| expected(t, shape.as_object().unwrap(), &named);
+    let heat = truth("thermal", "a2.z", 3e-12, &json!({"lag_s": 480.0}));
+    assert_eq!(of_named(&heat, faces("1_zp", "1_zm")).unwrap()[0].value, 3e-12);
+    let charge = truth("charge", "cube", 0.05, &json!({}));
+    assert_eq!(of_named(&charge, json!({"charge": "hk.cube_charge_c"})).unwrap()[0].value, 0.05);
+    assert_eq!(of_named(&truth("impulse", "cube.z", 1e-9, &json!({})), json!({})).unwrap().len(), 1);
     assert!(of(&truth("is-noise", "tm1.y", 1.0, &json!({"line_hz": 0.1})), json!({})).is_err());
     assert_eq!(value(&truth("is-noise", "tm1.y", 1.5, &json!({"line_hz": 0.0})), json!({})), 1.5);
     assert_eq!(of(&truth("tilt-to-length", "tm1", 1e-3, &json!({})), json!({})).unwrap()[1].value, 0.0);
