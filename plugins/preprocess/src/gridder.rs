@@ -270,7 +270,12 @@ impl Gridder {
     fn class_of(&self, table: usize, period_ns: i64) -> Class {
         let spec = &self.tables[table].spec;
         let stated_ns = spec.stated_rate_hz.map(|rate| (1e9 / rate) as i64);
-        let usual_ns = if spec.name == "ephemeris" { 60_000_000_000 } else { period_ns };
+        // Housekeeping with fewer than three rows in that time is slower than it can tell.
+        let usual_ns = match () {
+            () if spec.never_interpolated => period_ns,
+            () if spec.name == "ephemeris" => 60_000_000_000,
+            () => RATE_WINDOW_NS,
+        };
         let interval_ns = match self.intervals[table] {
             0 => stated_ns.unwrap_or(usual_ns),
             measured => measured,

@@ -400,6 +400,17 @@ fn housekeeping_at_any_rate_has_a_value_in_every_epoch() {
     }
 }
 
+/// Every seven minutes, and nobody states the rate.
+#[test]
+fn slow_housekeeping_without_a_rate_is_interpolated() {
+    let (mut tables, step) = (is_and_dws(30_000), 4_200 * DT);
+    tables.push(telemetry("hk/tank", &["value"], (0..8).map(|k| START + k * step), 3));
+    let (grid, _) = run(&tables);
+    assert!(grid.tables[2][0].iter().all(|v| !v.is_nan()));
+    let (first, second) = (tables[2].rows[0].1[0], tables[2].rows[1].1[0]);
+    assert!((grid.tables[2][0][2_100] - 0.5 * (first + second)).abs() < 1e-15);
+}
+
 /// Of three test masses each makes an epoch usable.
 #[test]
 fn an_epoch_is_used_with_any_of_three_test_masses() {
