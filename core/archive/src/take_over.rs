@@ -62,7 +62,7 @@ impl Archive {
         for (folder, id) in products {
             let found = Found::read(folder, id)?;
             let (_, newest) = self.newest_revision(found.row.stem())?;
-            if !newest.is_some_and(|newest| digest(&newest) == found.digest()) {
+            if newest.is_none_or(|newest| digest(&newest) != found.digest()) {
                 copy(staging.path(), folder, id, &mut contents)?;
             }
             all.push((folder, id, found));

@@ -73,7 +73,7 @@ fn setup(bench: &Bench, global: &Global, starts: bool) -> Result<Setup, Failure>
     }
     // Refuses a folder that is none, before a browser does.
     products::archive(&archive)?;
-    let of = |file: fn(&Operations) -> Option<std::path::PathBuf>| operations.as_ref().and_then(file);
+    let of = |file: fn(&Operations) -> Option<PathBuf>| operations.as_ref().and_then(file);
     let mission = bench.mission.clone().or_else(|| of(|o| o.mission.clone()));
     let named = |path: &PathBuf| format!(" --mission {}", text::quoted(&path.to_string_lossy()));
     let mission_flag = mission.as_ref().map(named).unwrap_or_default();
