@@ -120,8 +120,8 @@ fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<D
             command.args(global.plugin_dir.iter().flat_map(|dir| [Path::new("--plugin-dir"), dir.as_path()]));
             command.args(["--plugin-time-limit", &global.plugin_time_limit.to_string()]);
             command.envs(global.plugin_key.iter().map(|key| (super::PLUGIN_KEY, key)));
-            let said = tempfile::tempfile().at("make a file in", &std::env::temp_dir())?;
-            let stderr = said.try_clone().at("open", &std::env::temp_dir())?;
+            let said = tempfile::tempfile().at("make a file in", std::env::temp_dir())?;
+            let stderr = said.try_clone().at("open", std::env::temp_dir())?;
             command.args(["campaign", "task"]).arg(folder).arg(&id).stdout(Stdio::null()).stderr(stderr);
             let child = command.spawn().at("start", &exe)?;
             running.push((id.clone(), child, said));
