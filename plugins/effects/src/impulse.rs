@@ -18,7 +18,7 @@
 //! offset, by way of `α̂` or, where that is what is commanded, by responses of its own. A momentum on a test mass gives
 //! `p/m_m`.
 //!
-//! **Range**: ±1e-3 N s and N m s on the spacecraft (LISA Pathfinder: 0.2 to 230 µN s), ±1e-7 N s on a test mass.
+//! **Range**: ±1e-3 N s and N m s on the spacecraft (LISA Pathfinder: 0.2 to 230 µN s), ±2e-4 N s on a test mass.
 //! **Sign**: along the axis of SRF or ORF. **Confounders**: a hit and simultaneous glitches; an outlier of the
 //! attitude; rise and time of a glitch.
 
@@ -35,7 +35,9 @@ use crate::step_pulses::StepPulses;
 use crate::torque::responses_to_spacecraft_torque;
 
 const MAX_SPACECRAFT: f64 = 1e-3;
-const MAX_TEST_MASS: f64 = 1e-7;
+const MAX_TEST_MASS: f64 = 2e-4;
+/// Three times the σ that a glitch has before any data: those that were seen are far smaller than what could be.
+const USUAL_TEST_MASS: f64 = 1e-7;
 /// Decay times of candidate glitches, s. Exponentials a factor √2 apart share 97 % of their power.
 const DECAYS_S: [f64; 9] = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0];
 /// Rise times of candidate glitches, relative to the decay.
@@ -157,7 +159,8 @@ impl Impulse {
             Cause::Glitch => {
                 let mass_kg = self.mission.test_mass(tm_of(place), "the effect impulse")?.mass_kg;
                 let pushed = on(vec![response(accel_channel_of(place), pulse, 1.0 / mass_kg)])?;
-                vec![(coefficient("", "N s", MAX_TEST_MASS), pushed)]
+                let usual = coefficient("", "N s", USUAL_TEST_MASS);
+                vec![(Coefficient { lower: -MAX_TEST_MASS, upper: MAX_TEST_MASS, ..usual }, pushed)]
             }
             Cause::Torque => {
                 let axis = ["sc.phi", "sc.theta", "sc.psi"].iter().position(|i| *i == place);

@@ -99,6 +99,9 @@ pub(super) fn link(
                 .map(|leaf| table.columns.iter().position(|c| c.name == leaf.path).unwrap_or_default())
                 .collect();
             layout.redirect(&columns);
+            if table.name == "command" {
+                layout.absent_numbers_are_zero();
+            }
             routes[file].insert(channel, Route::Table { table: tables.len(), decoder: Decoder::new(&layout) });
         }
         tables.push(table);

@@ -231,6 +231,27 @@ mod tests {
         assert!(value("/dws", "sc_crf_rad.phi", &message).is_nan());
     }
 
+    /// Proto3 leaves out what is zero: a producer that does not turn its test masses sends no torque.
+    #[test]
+    fn a_command_that_is_not_set_is_zero() {
+        let mut layout = expected("/command").unwrap().clone();
+        layout.absent_numbers_are_zero();
+        // Command { mps_force_srf_n { y: 2 } tm1 { force_orf_n { x: 1 } } }
+        let mut message = vec![0x0a, 9, 0x11];
+        message.extend(2.0_f64.to_le_bytes());
+        message.extend([0x1a, 11, 0x0a, 9, 0x09]);
+        message.extend(1.0_f64.to_le_bytes());
+        let mut values = vec![f64::NAN; layout.leaves().len()];
+        Decoder::new(&layout).decode(&message, &mut Cells { values: &mut values, rows: 1, row: 0 }).unwrap();
+        let value = |path: &str| values[layout.leaves().iter().position(|leaf| leaf.path == path).unwrap()];
+        assert_eq!(
+            [value("mps_force_srf_n.y"), value("mps_force_srf_n.z"), value("tm1.force_orf_n.x")],
+            [2.0, 0.0, 1.0]
+        );
+        assert_eq!([value("mps_torque_srf_nm.x"), value("tm1.torque_orf_nm.z")], [0.0, 0.0]);
+        assert!(value("tm2.force_orf_n.x").is_nan(), "nothing is said of the other test mass");
+    }
+
     #[test]
     fn a_repeated_sub_message_merges() {
         // Dws { tm1 { theta: 1 } tm1 { psi: 2 } }: the second does not reset theta.

@@ -167,6 +167,22 @@ impl Layout {
         &self.ignored
     }
 
+    /// Lets a sub-message of nothing but numbers that is not there be zero where the message that should hold it is. Of
+    /// a readout it is no measurement, and stays NaN; of a command it is none.
+    pub fn absent_numbers_are_zero(&mut self) {
+        let only_numbers = |node: &Node| node.fields.iter().all(|field| matches!(field.slot, Slot::Scalar { .. }));
+        let numbers: Vec<Option<Vec<usize>>> =
+            self.nodes.iter().map(|node| only_numbers(node).then(|| node.implicit.clone())).collect();
+        for node in &mut self.nodes {
+            let held = node.fields.iter().filter_map(|field| match field.slot {
+                Slot::Message { node } => numbers[node].as_ref(),
+                Slot::Scalar { .. } => None,
+            });
+            let held: Vec<usize> = held.flatten().copied().collect();
+            node.implicit.extend(held);
+        }
+    }
+
     /// Sends leaf `i` to column `columns[i]`.
     ///
     /// # Panics
