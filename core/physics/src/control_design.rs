@@ -85,7 +85,7 @@ pub enum DesignError {
     /// Readout noise alone exceeds the requirement where the disturbance has to be suppressed.
     #[error(
         "control design, channel {channel}: requirement {requirement} is too greedy at {frequency_hz:.3e} Hz: \
-         1/|W1| + 1/|W3| < 1 there, since the readout's noise alone is {noise_ratio:.3} times the requirement and the \
+         1/|W1|² + 1/|W3|² < 1 there, since the readout's noise alone is {noise_ratio:.3} times the requirement and the \
          disturbance without control {disturbance_ratio:.3e} times; the best that any controller gives is \
          {best_ratio:.3} times. Relax the requirement or choose a quieter readout"
     )]
@@ -550,7 +550,10 @@ impl Problem {
         let points = |ratio: &dyn Fn(f64) -> f64, cap: f64| -> Vec<(f64, f64)> {
             sampling.grid(BAND_HZ.0, BAND_HZ.1).map(|f| (sampling.warped(f), ratio(f).min(cap))).collect()
         };
-        let mut disturbance = Lag::above(&points(&|f| model.disturbance_ratio(f), f64::INFINITY), |_| 0.0);
+        let disturbed = points(&|f| model.disturbance_ratio(f), f64::INFINITY);
+        // A disturbance that falls steeply lets the weight fall as far as it likes: not below half of what is there.
+        let fastest_point = disturbed.last().map_or(0.0, |(_, magnitude)| *magnitude);
+        let mut disturbance = Lag::above(&disturbed, |_| 0.5 * fastest_point);
         let headroom = headroom / model.bandwidth_factor.powi(2);
         let fastest = LARGEST_DELAY_ANGLE / sampling.delay_s();
         let headroom = headroom.max(disturbance.high / fastest.powi(2));
@@ -1062,7 +1065,19 @@ mod tests {
         assert!(
             (frequency_hz / 1e-3 - 1.0).abs() < 1e-6 && (noise_ratio / exact - 1.0).abs() < 1e-6 && *best_ratio > 2.5
         );
-        assert!(error.to_string().contains("no") && error.to_string().contains("1.000e-3 Hz"), "{error}");
+        assert!(
+            error.to_string().contains("noise alone is 2.546 times") && error.to_string().contains("1.000e-3 Hz"),
+            "{error}"
+        );
+
+        // Noise that falls steeply: a design, or a refusal in numbers.
+        for (corner_hz, exponent) in [(1.5e-3, 4), (1.7e-3, 4), (1.8e-3, 4), (4e-2, 2), (1e-3, 6)] {
+            let mut mission = taiji();
+            let force = mission.noise.thruster_force.as_mut().unwrap();
+            (force.corner_hz, force.exponent) = (corner_hz, exponent);
+            let said = design(&mission).map_or_else(|error| error.to_string(), |_| String::new());
+            assert!(!said.contains("NaN"), "{corner_hz}: {said}");
+        }
 
         let mut mission = taiji();
         mission.mission.sample_rate_hz = 1.0;

@@ -98,7 +98,8 @@ pub fn model(
         turned.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&lever);
         for axis in 0..3 {
             let row = 3 * t + axis;
-            let electrodes = if axis == 0 { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
+            let electrodes =
+                if tm.is_drag_free(axis) { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
             psd[(row, row)] = white(stray.clone()) * level("test_mass_acceleration", row).powi(2)
                 + electrodes * level("electrostatic_force", row).powi(2);
         }

@@ -349,10 +349,7 @@ impl Reconstruction {
             frame_rad_s2,
             omega_rad_s: if self.prediction { omega_sc + self.omega_ci_rad_s } else { self.omega_ci_rad_s },
         });
-        // The interpolation uses later readouts.
-        if !self.prediction {
-            self.interpolate_gaps();
-        }
+        self.interpolate_gaps();
         if self.smoother.waiting() == 2 * self.lag() {
             self.emit(self.lag(), rows);
         }

@@ -32,8 +32,9 @@ pub(crate) fn electrodes_of(test_mass: usize) -> std::ops::Range<usize> {
 const MAX_HOLD_S: f64 = 1.0;
 /// Largest rms difference of replayed and telemetered commands of the same law, relative to the rms change of the
 /// telemetered command from one sample to the next. That change comes from readout noise, which the same law with the
-/// same readout reproduces exactly.
-const SAME_LAW_RATIO: f64 = 0.5;
+/// same readout reproduces exactly. A wrong command acts like a push: a tenth of that change on the spacecraft is what
+/// the interferometers hardly see.
+const SAME_LAW_RATIO: f64 = 0.1;
 /// Samples to compare before a replayed command may replace a missing one.
 const MIN_COMPARED: u64 = 1000;
 
@@ -200,6 +201,8 @@ pub(crate) struct Replay {
     max_hold_samples: u32,
     /// Since the last restart.
     samples: u64,
+    /// Since the last one with a missing readout, which the controller on board had.
+    samples_with_readouts: u32,
     /// Last telemetered minus replayed command, the effect of unknown integrator states.
     offset: Option<CommandNumbers>,
     comparison: Comparison,
@@ -214,6 +217,7 @@ impl Replay {
             warm_up_samples: (warm_up_s * rate_hz).ceil() as u64,
             max_hold_samples: (MAX_HOLD_S * rate_hz).ceil() as u32,
             samples: 0,
+            samples_with_readouts: 0,
             offset: None,
             comparison: Comparison::new(numbers),
         }
@@ -227,6 +231,8 @@ impl Replay {
         sun_srf: Option<Vector3<f64>>,
         telemetered: Option<&CommandNumbers>,
     ) -> Result<Option<CommandNumbers>, StateError> {
+        let whole = readout.largest_age() == 0;
+        self.samples_with_readouts = if whole { self.samples_with_readouts.saturating_add(1) } else { 0 };
         if readout.largest_age() > self.max_hold_samples {
             if self.samples > 0 {
                 self.law.set_state(&self.initial_state).map_err(|_| StateError::Content("a control law"))?;
@@ -242,18 +248,25 @@ impl Replay {
         if self.samples <= self.warm_up_samples {
             return Ok(None);
         }
+        // For a while after a readout that was lost to us, the controller on board knew more.
+        let informed = self.samples_with_readouts > self.max_hold_samples;
         let Some(telemetered) = telemetered else {
             // A difference across the gap is not a change within one sample.
             self.comparison.previous = None;
-            let usable = self.unverified || (self.comparison.samples >= MIN_COMPARED && self.comparison.same_law());
+            let verified = self.comparison.samples >= MIN_COMPARED && self.comparison.same_law();
+            let usable = self.unverified || verified && informed;
             let offset = if self.unverified { Some(replayed.map(|_| 0.0)) } else { self.offset };
             return Ok(offset.filter(|_| usable).map(|offset| {
                 replayed.iter_mut().zip(&offset).for_each(|(replayed, offset)| *replayed += offset);
                 replayed
             }));
         };
-        self.offset = Some(CommandNumbers::from_fn(telemetered.len(), |i| telemetered[i] - replayed[i]));
-        self.comparison.add(telemetered, &replayed);
+        if informed {
+            self.offset = Some(CommandNumbers::from_fn(telemetered.len(), |i| telemetered[i] - replayed[i]));
+            self.comparison.add(telemetered, &replayed);
+        } else {
+            self.comparison.previous = None;
+        }
         Ok(None)
     }
 
@@ -266,6 +279,7 @@ impl Replay {
         state.f64s(&mut law)?;
         self.law.set_state(&law).map_err(|_| StateError::Content("a control law"))?;
         state.u64(&mut self.samples)?;
+        state.u32(&mut self.samples_with_readouts)?;
         let numbers = self.comparison.mean.len();
         state.option(&mut self.offset, |state, command| visit_command(state, numbers, command))?;
         self.comparison.visit(state)
