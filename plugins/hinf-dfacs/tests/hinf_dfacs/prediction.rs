@@ -1,4 +1,4 @@
-//! Prediction mode: rows depend on commands and past readouts alone.
+//! Prediction mode: rows depend on commands and past readouts alone, but for channels over a few missing readouts.
 
 use dragfree_hinf_dfacs::on_demand::Needs;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
@@ -81,16 +81,22 @@ fn acceleration_is_known_by_commands_alone() {
     }
 }
 
-/// A short gap is interpolated in the channels by two later readouts; in prediction mode it stays.
+/// A short gap is interpolated in the channels by two later readouts, in prediction mode too: a filter that had to begin
+/// anew after each would not settle where one packet in a thousand is lost. What is known of the motion does not change.
 #[test]
-fn gaps_stay_in_the_channels() {
-    let (mut epochs, _) = telemetry(&mission(), 200);
+fn short_gaps_are_bridged_in_the_channels() {
+    let (complete, _) = telemetry(&mission(), 200);
+    let mut epochs = complete.clone();
     epochs[100].readout[3] = f64::NAN;
-    for (needs, missing) in [(Needs::default(), vec![]), (PREDICTING, vec![99, 100, 101])] {
-        let mut stage = stage(&mission(), &Settings { needs, ..settings(Smoother) });
+    for needs in [Needs::default(), PREDICTING] {
+        let settings = Settings { needs, ..settings(Smoother) };
+        let mut stage = stage(&mission(), &settings);
         let rows = run(&mut stage, &epochs);
-        let got: Vec<usize> = (1..199).filter(|k| rows[*k].values[CHANNELS_AT].is_nan()).collect();
-        assert_eq!((got, stage.counts().readouts_bridged), (missing.clone(), u64::from(missing.is_empty())));
+        assert!((1..199).all(|k| rows[k].values[CHANNELS_AT].is_finite()));
+        assert_eq!(stage.counts().readouts_bridged, 1);
+        let whole = run(&mut crate::common::stage(&mission(), &settings), &complete);
+        let known = |rows: &[Row]| rows.iter().flat_map(|row| bits(&row.values[9..12])).collect::<Vec<_>>();
+        assert!(known(&rows) == known(&whole));
     }
 }
 

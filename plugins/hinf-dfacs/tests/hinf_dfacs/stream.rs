@@ -305,6 +305,22 @@ fn a_lost_command_is_filled_only_by_the_law_that_flew() {
     }
 }
 
+/// After a readout that was lost on the way down the law here does not command what the one on board did, for a second.
+#[test]
+fn a_replayed_command_waits_after_a_lost_readout() {
+    let mission = mission();
+    let (mut epochs, _) = telemetry(&mission, 4000);
+    epochs[3000].readout[3] = f64::NAN;
+    for k in [3000, 3003, 3050] {
+        epochs[k].command[0] = f64::NAN;
+    }
+    let mut stage = stage(&mission, &with_replay());
+    run(&mut stage, &epochs);
+    assert_eq!((stage.counts().commands_replayed, stage.counts().commands_missing), (1, 2));
+    let comparison = stage.comparison().expect("both were there");
+    assert!(comparison.rms_distance().iter().all(|d| *d < 1e-20), "{:?}", comparison.rms_distance());
+}
+
 /// A spacecraft that follows CRF as it turns: sensing sees nothing, and the inertial motion is CRF's own.
 #[test]
 fn the_turning_of_the_constellation_is_added() {
