@@ -273,7 +273,8 @@ impl Reconstruction {
         let tm_accel_per_alpha: Vec<_> = mission.test_mass.values().map(accel_per_alpha).collect();
         let replay = if settings.replay {
             let (law, numbers) = (ControlLaw::new(mission)?, 6 + 6 * test_masses);
-            Some(Replay::new(law, numbers, !settings.commands, settings.warm_up_s, settings.rate_hz))
+            let delay = mission.control.as_ref().map_or(0, |control| control.delay_samples as usize);
+            Some(Replay::new(law, delay, numbers, !settings.commands, settings.warm_up_s, settings.rate_hz))
         } else {
             None
         };

@@ -1,5 +1,7 @@
 //! Replay of the control law on telemetered readouts, to replace missing commands and to check telemetered ones.
 
+use std::collections::VecDeque;
+
 use dragfree_physics::control::{ControlLaw, PerTestMass, Readout, TestMassReadout};
 use dragfree_physics::few::Few;
 use dragfree_physics::mission::{MOST_TEST_MASSES, Mission};
@@ -201,7 +203,9 @@ pub(crate) struct Replay {
     max_hold_samples: u32,
     /// Since the last restart.
     samples: u64,
-    /// Since the last one with a missing readout, which the controller on board had.
+    /// Whether each of the last readouts was whole that no command comes from yet, the oldest first.
+    not_used_yet: VecDeque<bool>,
+    /// Since the last one with a missing readout, which the controller on board had, of those that commands come from.
     samples_with_readouts: u32,
     /// Last telemetered minus replayed command, the effect of unknown integrator states.
     offset: Option<CommandNumbers>,
@@ -209,8 +213,17 @@ pub(crate) struct Replay {
 }
 
 impl Replay {
-    pub(crate) fn new(law: ControlLaw, numbers: usize, unverified: bool, warm_up_s: f64, rate_hz: f64) -> Self {
+    /// `delay_samples` lie between a readout and the command that comes from it.
+    pub(crate) fn new(
+        law: ControlLaw,
+        delay_samples: usize,
+        numbers: usize,
+        unverified: bool,
+        warm_up_s: f64,
+        rate_hz: f64,
+    ) -> Self {
         Self {
+            not_used_yet: vec![true; delay_samples].into(),
             initial_state: law.state(),
             law,
             unverified,
@@ -231,7 +244,8 @@ impl Replay {
         sun_srf: Option<Vector3<f64>>,
         telemetered: Option<&CommandNumbers>,
     ) -> Result<Option<CommandNumbers>, StateError> {
-        let whole = readout.largest_age() == 0;
+        self.not_used_yet.push_back(readout.largest_age() == 0);
+        let whole = self.not_used_yet.pop_front().unwrap_or(true);
         self.samples_with_readouts = if whole { self.samples_with_readouts.saturating_add(1) } else { 0 };
         if readout.largest_age() > self.max_hold_samples {
             if self.samples > 0 {
@@ -280,6 +294,7 @@ impl Replay {
         self.law.set_state(&law).map_err(|_| StateError::Content("a control law"))?;
         state.u64(&mut self.samples)?;
         state.u32(&mut self.samples_with_readouts)?;
+        self.not_used_yet.iter_mut().try_for_each(|whole| state.flag(whole))?;
         let numbers = self.comparison.mean.len();
         state.option(&mut self.offset, |state, command| visit_command(state, numbers, command))?;
         self.comparison.visit(state)

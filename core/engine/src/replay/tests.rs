@@ -843,7 +843,13 @@ proptest! {
         let outcome = replay(&[bytes]);
         prop_assert_eq!(&outcome.tables, &tables);
         for (table, batch) in tables.iter().zip(&batches) {
-            prop_assert!(same(&outcome.rows[&table.name], batch), "{}", table.name);
+            let mut batch = batch.clone();
+            // What the spacecraft is not commanded is no command.
+            let of_spacecraft = table.columns.iter().map(|c| table.name == "command" && c.name.starts_with("mps_"));
+            for (column, _) in batch.columns.iter_mut().zip(of_spacecraft).filter(|(_, is)| *is) {
+                column.iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
+            }
+            prop_assert!(same(&outcome.rows[&table.name], &batch), "{}", table.name);
         }
         prop_assert!(!outcome.losses.data_loss());
     }

@@ -43,9 +43,9 @@ fn a_row_does_not_depend_on_later_readouts() {
     let [before, after] = [&epochs, &other].map(|epochs| rows(PREDICTING, epochs));
     for k in 0..CHANGED {
         assert_eq!(regressors(&before[k]), regressors(&after[k]), "epoch {k}");
-        // A channel's sample is complete with the next readout.
+        // A channel's sample is complete with the next readout; one beside a missing readout with the second after that.
         let channels = |rows: &[Row]| bits(&rows[k].values[CHANNELS_AT..]);
-        assert!(k + 1 == CHANGED || channels(&before) == channels(&after), "epoch {k}");
+        assert!(k + 3 > CHANGED || channels(&before) == channels(&after), "epoch {k}");
     }
     assert_ne!(regressors(&before[CHANGED]), regressors(&after[CHANGED]));
 
