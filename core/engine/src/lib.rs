@@ -88,8 +88,8 @@ pub enum EngineError {
 }
 
 impl EngineError {
-    /// Whether the machine is at fault, a disk or the memory, or somebody who wrote to a file meanwhile: the same run may
-    /// succeed another time.
+    /// Whether the machine is at fault, a disk or the memory, or somebody who wrote to a file meanwhile: the same run
+    /// may succeed another time.
     pub fn may_pass(&self) -> bool {
         use chain::ChainError;
         use config::ConfigError;

@@ -128,8 +128,8 @@ pub struct Estimate {
     pub theta: DVector<f64>,
     /// Covariance of the free coefficients; none when there is neither data nor range in some direction.
     pub covariance: Option<DMatrix<f64>>,
-    /// By how much σ of each of them was widened: for residuals beyond the refined Σ or blocks of time that scatter more
-    /// than chance allows, whichever is more, and for information that is uneven in time.
+    /// By how much σ of each of them was widened: for residuals beyond the refined Σ or blocks of time that scatter
+    /// more than chance allows, whichever is more, and for information that is uneven in time.
     pub widened: Vec<f64>,
     /// Directions that data and survey do not see.
     pub weak: Vec<Direction>,

@@ -149,8 +149,8 @@ pub fn model(
     })
 }
 
-/// Tables of `[noise]` with a coloured part that the filter leaves out: it has that of readouts, and of forces on a test
-/// mass the part whose PSD falls as 1/f².
+/// Tables of `[noise]` with a coloured part that the filter leaves out: it has that of readouts, and of forces on a
+/// test mass the part whose PSD falls as 1/f².
 pub fn without_their_colour(noise: &Noise) -> Vec<&'static str> {
     let coloured = |shape: Option<NoiseShape>, known: Option<u32>| {
         shape.is_some_and(|shape| shape.coloured().any(|term| Some(term.exponent) != known))

@@ -15,8 +15,8 @@ use crate::input::InputFile;
 /// Times and channels of messages.
 type Times = Vec<(i64, u16)>;
 
-/// Stretches without a gap of more than a day in which a file has messages, Unix ns, in order. A few messages by themselves
-/// are left out, as the replay drops them, unless there is nothing else.
+/// Stretches without a gap of more than a day in which a file has messages, Unix ns, in order. A few messages by
+/// themselves are left out, as the replay drops them, unless there is nothing else.
 ///
 /// # Errors
 /// The file can no longer be read.

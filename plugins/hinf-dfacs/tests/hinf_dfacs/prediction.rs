@@ -43,7 +43,7 @@ fn a_row_does_not_depend_on_later_readouts() {
     let [before, after] = [&epochs, &other].map(|epochs| rows(PREDICTING, epochs));
     for k in 0..CHANGED {
         assert_eq!(regressors(&before[k]), regressors(&after[k]), "epoch {k}");
-        // A channel's sample is complete with the next readout; one beside a missing readout with the second after that.
+        // A channel's sample is complete with the next readout; beside a missing one, with the second after that.
         let channels = |rows: &[Row]| bits(&rows[k].values[CHANNELS_AT..]);
         assert!(k + 3 > CHANGED || channels(&before) == channels(&after), "epoch {k}");
     }
@@ -81,8 +81,9 @@ fn acceleration_is_known_by_commands_alone() {
     }
 }
 
-/// A short gap is interpolated in the channels by two later readouts, in prediction mode too: a filter that had to begin
-/// anew after each would not settle where one packet in a thousand is lost. What is known of the motion does not change.
+/// A short gap is interpolated in the channels by two later readouts, in prediction mode too: a filter that had to
+/// begin anew after each would not settle where one packet in a thousand is lost. What is known of the motion does not
+/// change.
 #[test]
 fn short_gaps_are_bridged_in_the_channels() {
     let (complete, _) = telemetry(&mission(), 200);

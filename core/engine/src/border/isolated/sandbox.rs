@@ -87,8 +87,8 @@ const DENIED: &[c_long] = &[
     libc::SYS_vfork,
 ];
 
-/// Puts the calling thread, and all that it starts, behind the sandbox: the process must have no other. What this kernel
-/// does not have of it is told.
+/// Puts the calling thread, and all that it starts, behind the sandbox: the process must have no other. What this
+/// kernel does not have of it is told.
 ///
 /// # Errors
 /// A limit cannot be set.
