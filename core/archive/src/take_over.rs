@@ -33,11 +33,6 @@ impl Found {
             row: from.row(id)?,
         })
     }
-
-    /// Digest of what was found and from what.
-    fn digest(&self) -> &str {
-        &self.product.header.non_standard_attributes.sha256
-    }
 }
 
 /// What is about to be placed: digest and staged file of each content.
@@ -62,7 +57,7 @@ impl Archive {
         for (folder, id) in products {
             let found = Found::read(folder, id)?;
             let (_, newest) = self.newest_revision(found.row.stem())?;
-            if newest.is_none_or(|newest| digest(&newest) != found.digest()) {
+            if newest.is_none_or(|newest| digest(&newest) != digest(&found.product)) {
                 copy(staging.path(), folder, id, &mut contents)?;
             }
             all.push((folder, id, found));
@@ -77,7 +72,7 @@ impl Archive {
                 Some(known) => known,
                 None => self.newest_revision(&stem)?,
             };
-            if before.as_ref().is_some_and(|before| digest(before) == found.digest()) {
+            if before.as_ref().is_some_and(|before| digest(before) == digest(&found.product)) {
                 newest.insert(stem, (revision, before));
                 continue;
             }

@@ -101,7 +101,10 @@ fn verdict(product: &Product, paint: Paint) -> String {
                 }
                 "agree" => ("the recursive and the batch solution agree within their errors", paint.good(word)),
                 "weak" => ("the data leave directions open; do not use those alone", paint.doubtful(word)),
-                _ => ("solutions differ by more than their errors, or a test of the data fails", paint.bad(word)),
+                _ => (
+                    "solutions differ by more than their errors, or a test of the data fails; do not use",
+                    paint.bad(word),
+                ),
             };
             text::labelled("verdict", &format!("{word}: {meaning}")).replacen(word, &painted, 1)
         }

@@ -119,6 +119,7 @@ fn advice(row: &Row, product: &Product, diagnosed: &Diagnosed) -> (&'static str,
     }
     let many = product.header.non_standard_attributes.product == JOINT;
     let agreement = match () {
+        () if verdict == Some("weak") => "The data do not determine everything.",
         () if verdict != Some("agree") => "No two solutions were compared.",
         () if many => "What fits all days fits each.",
         () if product.result.is_compared() => "The recursive and the batch solution agree within their errors.",

@@ -177,6 +177,10 @@ fn a_day_is_of_use_where_nothing_speaks_against_it() {
     let unspoken = of(4, |document| document["result"]["verdict"] = json!(null));
     let joint = of(5, |document| document["header"]["non_standard_attributes"]["product"] = json!("COM2"));
     let lost = of(6, |document| document["quality"]["data_loss"] = json!(true));
+    let weak_and_lost = of(7, |document| {
+        document["quality"]["data_loss"] = json!(true);
+        document["result"]["verdict"] = json!("weak");
+    });
     let site = site(folder.path());
     for (id, class, said) in [
         (&compared, "good", "The recursive and the batch solution agree"),
@@ -185,6 +189,7 @@ fn a_day_is_of_use_where_nothing_speaks_against_it() {
         (&unspoken, "weak", "No two solutions were compared"),
         (&joint, "good", "What fits all days fits each"),
         (&lost, "lost", "data were lost"),
+        (&weak_and_lost, "lost", "The data do not determine everything. But data were lost"),
     ] {
         let text = page(&site, &format!("/day/{id}"));
         let sentence = text.split("<p class=\"verdict ").nth(1).and_then(|rest| rest.split("</p>").next());
